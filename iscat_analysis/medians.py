@@ -7,6 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+SIGMA_PER_MAD = 1.482602218505602
+"""Standard deviation of normal numbers over the median of their absolute deviations."""
+
+
+def robust_sigma(deviations: NDArray[np.floating]) -> float:
+    """Estimate the standard deviation of normal deviations from zero by their median size."""
+    return SIGMA_PER_MAD * float(np.median(np.abs(deviations)))
+
 
 def middle(values: NDArray[np.floating]) -> Any:
     """Give medians along the last axis, several times as fast as NumPy, which looks for NaN.

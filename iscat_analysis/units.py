@@ -35,3 +35,14 @@ def listed(items: Iterable[object], most: int) -> str:
     words = [str(item) for item in items]
     more = f" and {len(words) - most} more" if len(words) > most else ""
     return ", ".join(words[:most]) + more
+
+
+def are(n: int) -> str:
+    """Give the verb that belongs to so many."""
+    return "is" if n == 1 else "are"
+
+
+def frames_listed(numbers: Iterable[object]) -> str:
+    """Write the numbers of the first four frames, and how many more there are."""
+    numbers = list(numbers)
+    return f"frame{'' if len(numbers) == 1 else 's'} {listed(numbers, 4)}"

@@ -70,12 +70,12 @@ from iscat_analysis.camera.pixels import (
     boxes_of,
     find_text,
     find_unsteady,
-    text_message,
+    text_finding,
     text_summary,
-    unsteady_message,
+    unsteady_finding,
     without_text,
 )
 from iscat_analysis.camera.processed import Processing, find_processing
 from iscat_analysis.camera.regression import CameraCalibration, Estimate
 from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
-from iscat_analysis.camera.transfer import TOLERANCE, LightZero, find_zero, measure_transfer
+from iscat_analysis.camera.transfer import SIGMAS, TOLERANCE, LightZero, find_zero, measure_transfer

@@ -24,6 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.errors import DataError
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.camera import GAIN_OFF, NOISE_ROUNDED, PATTERN_SHAKES
 from iscat_analysis.records import BoolArray, FloatArray
 
 _APART, _FAR = 8, 16  # frames: filters are forgotten by then
@@ -217,29 +219,23 @@ class GainDiagnosis:
         )
 
     @property
-    def message(self) -> str | None:
-        """One sentence for the user where the gain is off; else None."""
+    def finding(self) -> Finding | None:
+        """What the user should know where the gain is off."""
         if not self.off:
             return None
-        problem = (
-            f"the noise variance is {self.noise_ratio:.3g} ± {self.noise_ratio_se:.1g} times what "
-            f"camera.gain_e_per_adu = {self.configured_gain:.4g} predicts"
-        )
+        values: dict[str, float | str] = {
+            "ratio": self.noise_ratio, "ratio_se": self.noise_ratio_se,
+            "gain": self.configured_gain, "measured": self.gain_e_per_adu,
+        }  # fmt: skip
         if self.noise_counts < 1:
-            return (
-                f"{problem}, but the noise is smaller than a count ({self.noise_counts:.2g}) and "
-                "rounding hides it: record or export the movie with more bits"
-            )
+            return NOISE_ROUNDED({**values, "noise_counts": self.noise_counts})
         if self.pattern_jitter is not None and self.shakes:
-            return (
-                f"{problem}; the gain is not the cause: the fixed pattern shakes by "
-                f"{self.pattern_jitter.rms_px:.2g} pixels from frame to frame, which explains "
-                f"{min(self.pattern_jitter.share, 1.0):.0%} of what is too much: damp vibrations "
-                "of the stage and the beam"
-            )
+            jitter = self.pattern_jitter
+            share = min(jitter.share, 1.0)
+            return PATTERN_SHAKES({**values, "rms_px": jitter.rms_px, "share": share, "follow": ""})
         # Noise that grows with the light itself can only add, so only an excess has two causes.
-        cause = "unless the light itself is noisy, " if self.noise_ratio > 1 else ""
-        return f"{problem}; {cause}set camera.gain_e_per_adu = {self.gain_e_per_adu:.4g}"
+        unless = "unless the light itself is noisy, " if self.noise_ratio > 1 else ""
+        return GAIN_OFF({**values, "unless": unless})
 
 
 def diagnose_gain(

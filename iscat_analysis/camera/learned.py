@@ -13,7 +13,7 @@ on the configuration has numbers, whatever they come from.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -39,6 +39,16 @@ from iscat_analysis.camera.spectrum import measure_spectrum
 from iscat_analysis.camera.transfer import TOLD, Transfer, judge_zero, measure_transfer
 from iscat_analysis.config import ASSUMED, AUTO, CameraConfig, Config, Optics, plausible_pixel
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.findings import Finding, existing
+from iscat_analysis.findings.camera import GAIN_ASSUMED, OFFSET_FROM_NOISE
+from iscat_analysis.findings.files import (
+    BITS_PADDED,
+    COARSE_PIXELS,
+    DISPLAYED_RATE,
+    FRAMES_DROPPED,
+    METADATA_DISAGREES,
+    OPTICS_OF_FILE,
+)
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import BoolArray, CountSource, StackMetadata
 from iscat_analysis.units import count
@@ -152,24 +162,18 @@ class LearnedCamera:
     config: CameraConfig
     camera: Camera
     numbers: Mapping[str, Number]
-    messages: tuple[str, ...]
+    findings: tuple[Finding, ...]
     level_e: float = 0.0
     refusal: str = ""
     response: Response | None = None
     text: BoolArray | None = None
     padded: int = 0
 
-    @property
-    def padding_message(self) -> str:
-        """Say that the camera's bits are not the lowest; empty where they are."""
+    def padding(self, name: str) -> Finding | None:
+        """Tell that the camera's bits are not the lowest."""
         if not self.padded:
-            return ""
-        return (
-            f"all counts are multiples of {2**self.padded}, as where "
-            f"{_WORD - self.padded} bits stand in the high bits of {_WORD}: a gain of a data "
-            f"sheet, per count of the camera, is to be divided by {2**self.padded}, an offset "
-            "multiplied; what the file's metadata say is taken so"
-        )
+            return None
+        return BITS_PADDED({"step": 2**self.padded, "bits": _WORD - self.padded}, where=name)
 
     @property
     def description(self) -> str:
@@ -222,8 +226,8 @@ def with_camera(
         movie if text is None else patched(movie, text),
         config.camera,
         span,
-        additive=optics.scheme == "darkfield",
-        moving=config.fit.mode == "track" and resolved,
+        additive=not optics.interferes,
+        moving=config.fit.follows_tracks and resolved,
         metadata=movie.metadata,
     )
     if learned.refusal:
@@ -266,7 +270,7 @@ def learn_camera(
         config=config.assumed.model_copy(update=changed),
         camera=replace(found.camera, law=found.law),
         numbers=numbers,
-        messages=tuple(found.messages),
+        findings=tuple(found.findings),
         level_e=found.level_e,
         refusal=found.refusal,
         response=found.response(),
@@ -285,7 +289,7 @@ class _Learning:
         self.changed: set[str] = set()
         self.law: Law | None = None
         self.transfer: Transfer | None = None
-        self.messages: list[str] = []
+        self.findings: list[Finding] = []
         self.level_e, self.refusal = 0.0, ""
         self._se = dict.fromkeys(ASSUMED, 0.0)
         self._source = {key: ASSUMPTION if key in free else CONFIGURED for key in ASSUMED}
@@ -348,10 +352,7 @@ class _Learning:
     def _cannot(self, why: str) -> None:
         """Say once that the gain keeps its default."""
         if self._source["gain_e_per_adu"] == ASSUMPTION:
-            self.messages.append(
-                f"the camera's gain cannot be learned from this movie, because {why}: "
-                f"camera.gain_e_per_adu = {ASSUMED['gain_e_per_adu']:g} is assumed; set it"
-            )
+            self.findings.append(GAIN_ASSUMED({"why": why, "gain": ASSUMED["gain_e_per_adu"]}))
 
     def _learn_gain(self) -> bool:
         """Measure the gain; False where it cannot be."""
@@ -450,11 +451,7 @@ class _Learning:
         self._set("offset_adu", offset, error, MEASURED)
         self.free.discard("offset_adu")
         if not law.flickers:
-            self.messages.append(
-                f"the camera's offset, {offset:.4g} ± {error:.2g} counts, is taken from how the "
-                "noise grows with the light, and is less if the light is noisy by itself: record a "
-                "dark, which tells it"
-            )
+            self.findings.append(OFFSET_FROM_NOISE({"offset": offset, "error": error}))
         self._learn_gain()
         self._learn_law()
 
@@ -553,14 +550,15 @@ _DISAGREEMENT = 0.01  # relative, between configuration and metadata
 _OPTICS_DISAGREEMENT = 0.05  # the aperture that was measured is some percent below the engraved one
 
 
-def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, tuple[str, ...]]:
+def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, list[Finding]]:
     """Set what the configuration leaves open from the metadata of the movie."""
     notes = []
     found: dict[str, float] = {}
+    source = {"source": metadata.source}
     for key, unit, words in (
-        ("pixel_size_nm", "nm", "pixel size"),
-        ("exposure_ms", "ms", "exposure"),
-        ("frame_rate_hz", "Hz", "frame rate"),
+        ("pixel_size_nm", " nm", "pixel size"),
+        ("exposure_ms", " ms", "exposure"),
+        ("frame_rate_hz", " Hz", "frame rate"),
     ):
         given: float | None = getattr(config.camera, key)
         read: float | None = getattr(metadata, key)
@@ -571,24 +569,16 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, t
                 _refuse_unlikely(read, metadata.source)
             found[key] = read
         elif abs(read / given - 1) > _DISAGREEMENT:
+            values: dict[str, float | str] = {"words": words, "given": given, "read": read}
             notes.append(
-                f"the {words} is {given:g} {unit} in the configuration (camera.{key}) but "
-                f"{read:g} {unit} in the movie's {metadata.source} metadata; "
-                "the configuration is used"
+                METADATA_DISAGREES({**values, **source, "unit": unit, "key": f"camera.{key}"})
             )
     shown_hz = metadata.displayed_hz
-    if config.fit.mode == "track" and shown_hz is not None and metadata.frame_rate_hz is None:
-        notes.append(
-            f"the {shown_hz:g} frames per second in the file are the speed at which ImageJ shows "
-            "the movie, which tells nothing of the camera, and are not used"
-        )
+    if config.fit.follows_tracks and shown_hz is not None and metadata.frame_rate_hz is None:
+        notes.append(DISPLAYED_RATE({"shown_hz": shown_hz}))
     if metadata.ticks is not None:
         missing = metadata.ticks[-1] + 1 - len(metadata.ticks)
-        notes.append(
-            f"the camera dropped {count(missing, 'frame')}, by the times in the movie's "
-            f"{metadata.source} metadata; diffusion coefficients and rates count the time that "
-            "passed"
-        )
+        notes.append(FRAMES_DROPPED({"frames": count(missing, "frame"), **source}))
     if config.camera.pixel_size_nm is None and "pixel_size_nm" not in found:
         raise DataError(
             "the pixel size is neither in the configuration nor in the movie's metadata; "
@@ -596,35 +586,28 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, t
         )
     camera = config.camera.model_copy(update=found)
     optics, taken_from_file = _with_optics(config.optics, metadata)
-    notes += taken_from_file
     config = config.model_copy(update={"camera": camera, "optics": optics})
-    source = f"in the movie's {metadata.source} metadata" if "pixel_size_nm" in found else ""
-    return config, (*notes, *_coarse_pixels(config, source or "in the configuration"))
+    where = f"in the movie's {metadata.source} metadata" if "pixel_size_nm" in found else ""
+    coarse = _coarse_pixels(config, where or "in the configuration")
+    return config, existing([*notes, *taken_from_file, coarse])
 
 
-def _with_optics(optics: Optics, metadata: StackMetadata) -> tuple[Optics, list[str]]:
+def _with_optics(optics: Optics, metadata: StackMetadata) -> tuple[Optics, list[Finding]]:
     """Replace defaults of the optics by the metadata of the movie."""
     found: dict[str, float] = {}
     notes = []
     for key, unit, words in (("wavelength_nm", " nm", "wavelength"), ("na", "", "NA")):
         given: float = getattr(optics, key)
         read: float | None = getattr(metadata, key)
-        if read is None:
+        if read is None or given == read:
             continue
-        where = f"in the movie's {metadata.source} metadata"
-        if given == read:
-            continue
+        values: dict[str, float | str] = {"words": words, "given": given, "read": read}
+        values |= {"unit": unit, "source": metadata.source, "key": f"optics.{key}"}
         if given == type(optics).model_fields[key].default:
             found[key] = read
-            notes.append(
-                f"the {words} is {read:g}{unit}, as {where}, and not {given:g}{unit}, which is "
-                f"the default of optics.{key}"
-            )
+            notes.append(OPTICS_OF_FILE(values))
         elif abs(read / given - 1) > _OPTICS_DISAGREEMENT:
-            notes.append(
-                f"the {words} is {given:g}{unit} in the configuration (optics.{key}) but "
-                f"{read:g}{unit} {where}; the configuration is used"
-            )
+            notes.append(METADATA_DISAGREES(values))
     if not found:
         return optics, notes
     try:
@@ -635,20 +618,19 @@ def _with_optics(optics: Optics, metadata: StackMetadata) -> tuple[Optics, list[
         ) from None
 
 
-def _coarse_pixels(config: Config, where: str) -> Iterator[str]:
-    """Warn that pixels are larger than the spot of a particle; refuse twice that size."""
+def _coarse_pixels(config: Config, where: str) -> Finding | None:
+    """Find pixels that are larger than the spot of a particle; refuse twice that size."""
     optics, pixel_nm = config.optics, config.camera.pixel_size_nm
     spot_nm = optics.wavelength_nm / (2 * optics.na)
     if pixel_nm is None or pixel_nm <= spot_nm:
-        return
-    problem = (
-        f"a pixel of {pixel_nm:g} nm, as {where}, is larger than the spot of a particle is wide: "
-        f"about {spot_nm:.3g} nm, optics.wavelength_nm over twice optics.na"
-    )
-    advice = "give its size in the sample plane, as in camera.pixel_size_nm = 84.4"
+        return None
+    finding = COARSE_PIXELS({"pixel_nm": pixel_nm, "where": where, "spot_nm": spot_nm})
     if pixel_nm > 2 * spot_nm:
-        raise DataError(f"{problem}; {advice}")
-    yield f"{problem}, so that pictures are not resolved; unless it was binned so far, {advice}"
+        problem = finding.text.partition(", so that")[0]
+        raise DataError(
+            f"{problem}; give its size in the sample plane, as in camera.pixel_size_nm = 84.4"
+        )
+    return finding
 
 
 def _refuse_unlikely(pixel_nm: float, source: str) -> None:

@@ -44,7 +44,7 @@ scale, down to that of a particle: then nothing is divided out.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -56,6 +56,8 @@ from scipy import fft
 from scipy.special import chdtri
 
 from iscat_analysis.camera.counts import Camera
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.camera import LIGHT_ADDED, LIGHT_FRINGES, LIGHT_SEAMS, LIGHT_SMOOTH
 from iscat_analysis.records import BoolArray, FloatArray
 
 LEAST_CONTRAST_SHARE = 0.02
@@ -539,45 +541,23 @@ class Surface:
             or self.stray_light
         )
 
-    @property
-    def messages(self) -> list[str]:
-        """Messages for the user, one line each."""
-        lines = []
+    def findings(self, name: str) -> Iterator[Finding]:
+        """Give what the user should know, one finding for each kind of change."""
         if self.degree:
-            lines.append(
-                f"the light changes slowly over the field, by {100 * self.rms:.2g} % rms between "
-                "frames that are compared, as where the beam wanders or fringes pass: each frame "
-                f"was divided by its own smooth light, a polynomial of degree {self.degree}"
-            )
+            values = {"percent": 100 * self.rms, "degree": self.degree}
+            yield LIGHT_SMOOTH(values, where=name)
         if len(self.fringes.waves):
             periods = " and ".join(f"{period:.3g}" for period in self.fringes.periods_px)
-            lines.append(
-                f"fringes with a period of {periods} pixels pass over the field, and change the "
-                f"light by {100 * self.fringes.rms:.2g} % rms between frames that are compared: "
-                "each frame was divided by its own; what reflects the laser beside the sample "
-                "makes them: tilt it, or take a source that is less coherent"
-            )
+            yield LIGHT_FRINGES({"periods": periods, "percent": 100 * self.fringes.rms}, where=name)
         if any(self.amplifier_boundaries):
             parts = " and ".join(
-                f"{name} {', '.join(map(str, cuts))}"
-                for name, cuts in zip(("row", "column"), self.amplifier_boundaries, strict=True)
+                f"{axis} {', '.join(map(str, cuts))}"
+                for axis, cuts in zip(("row", "column"), self.amplifier_boundaries, strict=True)
                 if cuts
             )
-            lines.append(
-                f"parts of the field, which begin at {parts}, change as a whole, as where the "
-                "camera reads them out by amplifiers of their own: each part of each frame was "
-                "divided by its own light"
-            )
+            yield LIGHT_SEAMS({"parts": parts}, where=name)
         if self.stray_light:
-            lines.append(
-                "dim pixels change by more of their light than bright ones, as where something is "
-                f"added to all of them that changes by {100 * self.stray_light:.2g} % of the mean "
-                "light within the movie: light that does not come through the objective, the "
-                "offset of a camera that warms up, or what focus does; each frame was divided by "
-                "its own, but what is added all the time is not known, and masses may be wrong by "
-                "as much"
-            )
-        return lines
+            yield LIGHT_ADDED({"percent": 100 * self.stray_light}, where=name)
 
     @cached_property
     def _axes(self) -> tuple[FloatArray, FloatArray]:

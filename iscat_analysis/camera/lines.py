@@ -17,6 +17,7 @@ Light that changes smoothly over the field is measured by a polynomial, of which
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,6 +28,8 @@ from iscat_analysis.camera.background import find_defects
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.light import Surface
 from iscat_analysis.camera.spectrum import measure_spectrum
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.camera import LINES_FLICKER
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import CountSource, FloatArray, StackMetadata
 
@@ -41,24 +44,15 @@ class Lines:
     shares: tuple[float, float]
     surface: Surface | None = None
 
-    @property
-    def messages(self) -> list[str]:
-        """Messages for the user, one line each."""
-        lines = []
+    def findings(self, name: str) -> Iterator[Finding]:
+        """Give what the user should know."""
         if self.surface is not None:
-            lines += self.surface.messages
+            yield from self.surface.findings(name)
         if any(self.shares):
-            lines.append(self._flicker)
-        return lines
-
-    @property
-    def _flicker(self) -> str:
-        names = [n for n, share in zip(("rows", "columns"), self.shares, strict=True) if share]
-        parts = " and ".join(f"{100 * share:.2g} %" for share in self.shares if share)
-        return (
-            f"whole {' and '.join(names)} flicker ({parts} of the noise variance): each of the "
-            f"{' and '.join(names)} of each frame was divided by its own light"
-        )
+            flicker = [(n, s) for n, s in zip(("rows", "columns"), self.shares, strict=True) if s]
+            lines = " and ".join(n for n, _ in flicker)
+            percents = " and ".join(f"{100 * share:.2g} %" for _, share in flicker)
+            yield LINES_FLICKER({"lines": lines, "percents": percents}, where=name)
 
     @property
     def summary(self) -> dict[str, Any]:

@@ -29,6 +29,8 @@ from scipy.special import chdtri
 
 from iscat_analysis._kernels.unsteady import add_image, add_scatter, block_extremes, block_powers
 from iscat_analysis.camera.counts import Camera
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.camera import PIXELS_UNSTEADY, TEXT_BURNT_IN
 from iscat_analysis.movie import ChangedFrames, Stack
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.units import count, listed
@@ -63,18 +65,15 @@ class PatchedFrames(ChangedFrames):
         return counts
 
 
-def text_message(text: BoolArray, name: str) -> str:
-    """Say where text is burnt in.
+def text_finding(text: BoolArray, name: str) -> Finding:
+    """Tell where text is burnt in.
 
     Shapes: `text` (y, x).
     """
     boxes = " and ".join(
         f"rows {a.start}:{a.stop}, columns {b.start}:{b.stop}" for a, b in boxes_of(text)
     )
-    return (
-        f"{name}: a text is burnt into the frames ({boxes}), whose {int(text.sum())} pixels are "
-        "left out; what lies beneath it is lost: switch it off in the program that records"
-    )
+    return TEXT_BURNT_IN({"boxes": boxes, "pixels": int(text.sum())}, where=name)
 
 
 def text_summary(text: BoolArray) -> list[dict[str, list[int]]]:
@@ -201,25 +200,23 @@ _LINE_SHARE = 0.5  # of the pixels of a line that is named as such
 _MOST_PIXEL_SHARE = 0.1  # of the pixels: where more are, it is not the pixels that are odd
 
 
-def unsteady_message(pixels: BoolArray) -> str:
-    """Say which pixels are unsteady.
+def unsteady_finding(pixels: BoolArray, name: str) -> Finding:
+    """Tell which pixels are unsteady.
 
     Shapes: `pixels` (y, x).
     """
     number = int(pixels.sum())
-    where = [
-        f"{name} {listed(np.flatnonzero(pixels.mean(axis=axis) > _LINE_SHARE), 4)}"
-        for axis, name in ((1, "row"), (0, "column"))
-        if (pixels.mean(axis=axis) > _LINE_SHARE).any()
-    ]
+    lines = (
+        (word, np.flatnonzero(pixels.mean(axis=axis) > _LINE_SHARE))
+        for axis, word in ((1, "row"), (0, "column"))
+    )
+    where = [f"{word} {listed(found, 4)}" for word, found in lines if found.size]
     if not where:
         y, x = np.nonzero(pixels)
         where = [listed([f"({a}, {b})" for a, b in zip(x, y, strict=True)], 3)]
-    verb = "has" if number == 1 else "have"
-    return (
-        f"{count(number, 'pixel')} ({' and '.join(where)}) {verb} noise that is not the light's, "
-        "as where a pixel switches, an amplifier is noisy or a text is burnt in; not used"
-    )
+    have = "has" if number == 1 else "have"
+    values = {"pixels": count(number, "pixel"), "where": " and ".join(where), "have": have}
+    return PIXELS_UNSTEADY(values, where=name)
 
 
 def find_unsteady(

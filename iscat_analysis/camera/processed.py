@@ -18,6 +18,9 @@ from scipy import fft
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.drift import middle_of
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.camera import FRAMES_PROCESSED
+from iscat_analysis.medians import robust_sigma
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource
 
 _PAIRS = 48  # of neighbouring frames, all over the movie
@@ -32,7 +35,6 @@ _LEAST_SIGMAS = 6.0  # standard errors
 _LEAST_NOISE_CHANGE = 0.1  # of the finest noise, by which it must change from frame to frame
 _WEAK, _STRONG = 0.5, 2.0  # finest noise over that at coarser patterns
 _MEDIAN_ERROR = 2.33  # √n times the relative error of a variance by the median deviation of n
-_SIGMA_PER_MAD = 1.4826  # standard deviation of a normal law over its median deviation
 
 Kind = Literal["interpolated", "smoothed", "sharpened"]
 
@@ -50,25 +52,29 @@ class Processing:
     uneven: float
 
     @property
-    def message(self) -> str:
-        """Message for the user."""
-        what = {
-            "interpolated": "the frames were interpolated, as where a movie is aligned by parts of "
-            f"a pixel: the noise of the finest patterns changes by {100 * self.uneven:.0f} % "
-            "from frame to frame, which no camera does",
-            "smoothed": "the frames were smoothed, denoised or compressed with losses: the finest "
-            f"patterns have {100 * self.finest:.0f} % of the noise of coarser ones, where a "
-            "camera has as much",
-            "sharpened": "the frames were sharpened: the finest patterns have "
-            f"{self.finest:.1f} times the noise of coarser ones, where a camera has as much",
+    def finding(self) -> Finding:
+        """What the user should know."""
+        what, instead = {
+            "interpolated": (
+                "interpolated, as where a movie is aligned by parts of a pixel: the noise of the "
+                f"finest patterns changes by {100 * self.uneven:.0f} % from frame to frame, which "
+                "no camera does",
+                "the movie before it was aligned (its drift is measured and followed here), or "
+                "shift it by whole pixels",
+            ),
+            "smoothed": (
+                "smoothed, denoised or compressed with losses: the finest patterns have "
+                f"{100 * self.finest:.0f} % of the noise of coarser ones, where a camera has as "
+                "much",
+                "the camera's own counts, uncompressed or compressed without losses",
+            ),
+            "sharpened": (
+                f"sharpened: the finest patterns have {self.finest:.1f} times the noise of coarser "
+                "ones, where a camera has as much",
+                "the camera's own counts",
+            ),
         }[self.kind]
-        instead = {
-            "interpolated": "the movie before it was aligned (its drift is measured and followed "
-            "here), or shift it by whole pixels",
-            "smoothed": "the camera's own counts, uncompressed or compressed without losses",
-            "sharpened": "the camera's own counts",
-        }[self.kind]
-        return f"{what}; all rows are flagged processed: export {instead}"
+        return FRAMES_PROCESSED({"what": what, "instead": instead, **self.summary})
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -116,7 +122,7 @@ def _uneven(values: FloatArray, chance: float) -> float:
     Some that lie far off do not count, as of frames that are cut off.
     """
     middle = float(np.median(values))
-    scatter = _SIGMA_PER_MAD * float(np.median(np.abs(values - middle))) / middle
+    scatter = robust_sigma(values - middle) / middle
     excess = scatter**2 - chance
     significant = excess > _LEAST_SIGMAS * chance * _MEDIAN_ERROR / math.sqrt(len(values))
     return math.sqrt(excess) if significant else 0.0
@@ -150,6 +156,6 @@ def _spectrum(
     change = np.where(used, (after - before) / np.sqrt(np.where(used, light, 1.0)), 0.0)
     # shot noise over the light: alike in all frames, whatever the laser does
     change *= math.sqrt(2 / (1 / powers[0] + 1 / powers[1]))
-    limit = _OUTLIER_SIGMAS * _SIGMA_PER_MAD * float(np.median(np.abs(change[used])))
+    limit = _OUTLIER_SIGMAS * robust_sigma(change[used])
     waves = fft.rfft2(np.clip(change, -limit, limit))
     return np.asarray(np.square(waves.real) + np.square(waves.imag))

@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from iscat_analysis.camera.counts import Camera
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.camera import NOISE_CORRELATED
+from iscat_analysis.medians import SIGMA_PER_MAD
 from iscat_analysis.records import BoolArray, FloatArray
 
 REACH_PX = 6
@@ -34,7 +37,6 @@ _EVERY_NTH_PIXEL = 8  # of as many pixels, whose median tells how large the nois
 LEAST_SIGMAS = 4.5  # standard errors beyond which a correlation is one
 _LEAST_CORRECTION = 0.01  # of the expected variance, below which nothing is corrected
 _LEAST_VARIANCE = 0.05  # of the variance, that every frequency is taken to have
-_NORMAL_QUARTILE = 0.6744897501960817
 
 
 @dataclass(frozen=True)
@@ -115,8 +117,8 @@ class NoiseSpectrum:
         }
 
     @property
-    def message(self) -> str:
-        """One line about what differs from white noise; empty where only the variance differs."""
+    def finding(self) -> Finding | None:
+        """What differs from white noise; None where only the variance differs."""
         parts = []
         x, y = self.neighbours
         if self.correlated:
@@ -127,12 +129,10 @@ class NoiseSpectrum:
             if part:
                 parts.append(f"whole {lines} flicker ({100 * part:.2g} % of the noise variance)")
         if not parts:
-            return ""
-        return (
-            " and ".join(parts)
-            + ": the search accounts for it, so that false alarms are as configured; the fits "
-            "assume independent pixels, so that their σ are wrong"
-        )
+            return None
+        row, column = self.shared
+        values = {"x": x, "y": y, "row_share": row, "column_share": column}
+        return NOISE_CORRELATED({"what": " and ".join(parts), **values})
 
 
 def measure_spectrum(
@@ -184,7 +184,7 @@ def measure_spectrum(
         z /= np.sqrt(by_light * expected + by_frame * read_noise)
         z[~used] = 0.0
         middle = float(np.median(np.abs(z[used][::_EVERY_NTH_PIXEL])))
-        return z, _OUTLIER_SIGMAS * middle / _NORMAL_QUARTILE
+        return z, _OUTLIER_SIGMAS * SIGMA_PER_MAD * middle
 
     def outliers(found: tuple[NDArray[np.float32], float] | None) -> int:
         return 0 if found is None else int(np.count_nonzero(np.abs(found[0]) > found[1]))

@@ -31,7 +31,7 @@ from iscat_analysis.diagnosis.noise import (
     judge_beside,
     judge_counts,
     judge_window,
-    law_messages,
+    law_finding,
     survey_over,
 )
 from iscat_analysis.diagnosis.recognise import (

@@ -29,7 +29,7 @@ from iscat_analysis.camera import (
     refuse_overflow,
     refuse_ratio,
     resolve_metadata,
-    text_message,
+    text_finding,
     whole_frames,
     with_camera,
     without_text,
@@ -38,12 +38,19 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.causes import axes_warning
 from iscat_analysis.diagnosis.frames import KeptFrames, refuse_channels, without_repeats
 from iscat_analysis.diagnosis.light import JudgedLight, judge_light
-from iscat_analysis.diagnosis.motion import motion_message, with_drift_correction
-from iscat_analysis.diagnosis.noise import NoiseSurvey, law_messages, survey_noise
+from iscat_analysis.diagnosis.motion import motion_in, with_drift_correction
+from iscat_analysis.diagnosis.noise import NoiseSurvey, law_finding, survey_noise
 from iscat_analysis.diagnosis.recognise import Changes, look_at_changes
 from iscat_analysis.diagnosis.stretches import Stretches, find_stretches
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.findings import Finding, aside, remark, unreported
+from iscat_analysis.findings import Finding, existing, unreported
+from iscat_analysis.findings.camera import (
+    BACKGROUND_WAY,
+    CAMERA_NUMBERS,
+    PATTERN_FOLLOWED,
+    TEMPLATE_BOUNDS,
+)
+from iscat_analysis.findings.files import FILE_IMPLIES
 from iscat_analysis.fitting.ranges import (
     BackgroundMode,
     background_mode,
@@ -111,7 +118,7 @@ class Prepared:
     @property
     def tracked(self) -> bool:
         """Whether particles are followed from frame to frame."""
-        return self.config.fit.mode == "track"
+        return self.config.fit.follows_tracks
 
     @property
     def camera(self) -> Camera:
@@ -170,28 +177,26 @@ def within(config: Config, frames: tuple[int, int] | None) -> Config:
     return config.model_copy(update={"fit": fit})
 
 
-Step = Callable[[Prepared], tuple[Prepared, Sequence[Finding]]]
+Step = Callable[[Prepared], tuple[Prepared, Sequence[Finding | None]]]
 """What is known → what is known after the step, and what it found."""
 
 _FIRST_FRAMES = 64  # frames that are looked at before anything else, fewer of a large field
 
 
-def metadata(state: Prepared) -> tuple[Prepared, list[Finding]]:
+def metadata(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
     """Choose the channel, and take what the file says of the recording."""
     config = state.config
-    if config.optics.scheme == "darkfield":
+    if not config.optics.interferes:
         darkfield_photons(config.particle)
     movie = state.movie.channel(config.camera.channels)
     config, notes = resolve_metadata(config, movie.metadata)
-    findings = [remark(note) for note in (*movie.notes, *notes)]
-    findings.append(aside(describe_background_mode(config)))
+    findings: list[Finding | None] = [
+        *(FILE_IMPLIES({"text": note}) for note in movie.notes),
+        *notes,
+    ]
+    findings.append(BACKGROUND_WAY({"text": describe_background_mode(config)}))
     if config.optics.psf == "measured":
-        findings.append(
-            remark(
-                'optics.psf = "measured": bounds are those of the template, and there is no '
-                "quantum bound: a measured picture does not give the field"
-            )
-        )
+        findings.append(TEMPLATE_BOUNDS())
     span = fitted_frames(movie, config, config.background.recorded)
     state = replace(
         state, stored=movie, whole=movie, movie=movie, steady=movie, config=config, asked=config,
@@ -200,10 +205,10 @@ def metadata(state: Prepared) -> tuple[Prepared, list[Finding]]:
     return state, findings
 
 
-def breaks(state: Prepared) -> tuple[Prepared, list[Finding]]:
+def breaks(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
     """Find where a landing movie breaks; what is learned of it is learned within one stretch."""
     config, movie = state.config, state.movie
-    if state.background_mode != "sliding" or config.optics.scheme == "darkfield":
+    if state.background_mode != "sliding" or not config.optics.interferes:
         if config.fit.excluded_frames:
             raise ConfigError(
                 "fit.excluded_frames: frames are left out of landing movies only, which have an "
@@ -215,25 +220,24 @@ def breaks(state: Prepared) -> tuple[Prepared, list[Finding]]:
     if not found.breaks:
         return replace(state, stretches=found), []
     state = replace(state, stretches=found, config=within(config, found.main))
-    return state, [remark(found.message(movie.name))]
+    return state, [found.finding(movie.name)]
 
 
-def camera(state: Prepared) -> tuple[Prepared, list[Finding]]:
+def camera(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
     """Refuse what is no camera's movie, learn the camera's numbers, and leave out burnt-in text."""
     movie, config, stated = state.movie, state.config, state.camera
     name, learned_from = movie.name, state.learned_from
     refuse_ratio(movie.read(0, 1)[0], f"{name}: frame 0", stated)
     refuse_channels(movie.read(*_first_frames(state)), stated, name)
     movie, config, known = with_camera(movie, config, learned_from)
-    findings = [remark(f"{name}: {text}") for text in (*known.messages, *law_messages(known))]
+    findings = [*(replace(one, where=name) for one in known.findings), law_finding(known, name)]
     stored = state.stored
     if known.text is not None:
         stored = without_text(stored, known.text, known.camera)
-        findings.append(remark(text_message(known.text, name)))
-    if known.padding_message:
-        findings.append(aside(f"{name}: {known.padding_message}"))
+        findings.append(text_finding(known.text, name))
+    findings.append(known.padding(name))
     if state.config.camera.assumed is not state.config.camera:
-        findings.append(aside(f"{name}: {known.description}"))
+        findings.append(CAMERA_NUMBERS({"text": known.description}, where=name))
     state = replace(
         state, stored=stored, whole=movie, movie=movie, steady=movie, config=config, known=known,
         summary={"camera": known.summary},
@@ -241,38 +245,38 @@ def camera(state: Prepared) -> tuple[Prepared, list[Finding]]:
     return state, findings
 
 
-def repeats(state: Prepared) -> tuple[Prepared, list[Finding]]:
+def repeats(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
     """Leave out frames that were stuck in the camera, where a background was recorded."""
     config = state.config
-    if state.background_mode != "fixed" or state.tracked or config.optics.scheme == "darkfield":
+    if state.background_mode != "fixed" or state.tracked or not config.optics.interferes:
         return state, []
     kept = without_repeats(state.movie, config, state.camera)
     state = replace(state, movie=kept.movie, steady=kept.movie, config=kept.config, kept=kept)
-    return state, [remark(kept.message)] if kept.message else []
+    return state, [kept.finding]
 
 
-def counts(state: Prepared) -> tuple[Prepared, list[Finding]]:
+def counts(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
     """Refuse counts that no camera gives, and find what was done to them before."""
     movie, name = state.movie, state.movie.name
     processing = find_processing(movie, state.camera, state.span, moving=state.tracked)
-    findings = [] if processing is None else [remark(f"{name}: {processing.message}")]
     start, stop = _first_frames(state)
     seen = movie.read(start, stop)
     if state.background_mode != "sliding":  # windows that slide pass over frames that repeat
         _refuse_still(seen, f"{name}: frames {start} to {stop - 1}")
     refuse_overflow(state.stored.read(start, stop), name)
-    if swapped := axes_warning(name, seen):
-        findings.append(remark(swapped))
+    findings = [axes_warning(name, seen)]
     if processing is None:
         return state, findings
+    findings.insert(0, replace(processing.finding, where=name))
     summary = {**state.summary, "processing": processing.summary}
     return replace(state, processing=processing, summary=summary), findings
 
 
-def light(state: Prepared) -> tuple[Prepared, list[Finding]]:
+def light(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
     """Divide out unsteady light; of a landing movie judge motion, noise and window, too."""
     movie, config, name = state.movie, state.config, state.movie.name
-    opening, changes, findings = None, None, []
+    opening, changes = None, None
+    findings: list[Finding | None] = []
     follow = state.ahead and (state.tracked or state.background_mode == "sliding")
     with one_thread_algebra():  # in all threads until the light is judged
         if state.background_mode == "sliding":
@@ -280,14 +284,13 @@ def light(state: Prepared) -> tuple[Prepared, list[Finding]]:
             if config.background.drift_correction == "auto":
                 config = with_drift_correction(config, moves=bool(motion))
             if motion:
-                said = f"{name}: {motion}; its motion is followed and divided out"
-                findings.append(aside(said))
+                findings.append(PATTERN_FOLLOWED({"what": motion}, where=name))
                 judged, opening, _ = _landing_light(state, config)
         else:
             if follow:  # in the light as it is; again if anything of it is unsteady
                 changes = start_in_thread(look_at_changes, movie, config, state.camera, state.span)
             judged = judge_light(movie, config, state.camera)
-    findings += [remark(f"{name}: {text}") for text in judged.messages]
+    findings += judged.findings
     if follow and (changes is None or judged.steady is not movie):
         steady = judged.steady
         changes = start_in_thread(look_at_changes, steady, config, state.camera, state.span)
@@ -321,7 +324,7 @@ def calibrated(
     state = Prepared(movie, movie, movie, movie, config, config, known, ahead, notify)
     for step in steps:
         state, findings = step(state)
-        for finding in findings:
+        for finding in existing(findings):
             report(finding)
     return state
 
@@ -343,7 +346,7 @@ def _landing_light(state: Prepared, config: Config) -> tuple[JudgedLight, NoiseS
     def survey_light(seen: Stack) -> tuple[NoiseSurvey, str]:
         opening = survey_noise(reader_of(seen, config, state.camera, span), config)
         left_open = config.background.drift_correction == "auto"
-        motion = motion_message(opening) if left_open else ""
+        motion = motion_in(opening) if left_open else ""
         opening.reader.forget_sample()
         if state.ahead and not motion:
             sum_first_chunk(opening.reader, config, opening.window)

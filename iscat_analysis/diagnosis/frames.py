@@ -23,12 +23,14 @@ from numpy.typing import NDArray
 from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.camera import FRAMES_DARK, REPEATS_LEFT_OUT
 from iscat_analysis.fitting.ranges import frame_ranges
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.movie import ChangedFrames, Stack, StackFrames
 from iscat_analysis.records import BoolArray, Windows
 from iscat_analysis.search.frames import DARK, cut_off, measure_frames, well_lit
-from iscat_analysis.units import listed
+from iscat_analysis.units import are, frames_listed
 
 _MOST = 4  # channels that are looked for
 _ALIKE = 0.1  # of the mean square difference of others, by which frames of one channel differ
@@ -78,8 +80,6 @@ def channels_of(counts: NDArray[Any], camera: Camera) -> int:
 _DIM = 0.97
 """Share of the usual light, below which a part of a frame may be missing."""
 
-_NAMED = 4
-
 
 @dataclass(frozen=True, eq=False)
 class _DarkFramesReplaced(ChangedFrames):
@@ -98,7 +98,7 @@ class _DarkFramesReplaced(ChangedFrames):
         return counts
 
 
-def without_cut_off(movie: Stack, camera: Camera, windows: Windows) -> tuple[Stack, str]:
+def without_cut_off(movie: Stack, camera: Camera, windows: Windows) -> tuple[Stack, Finding | None]:
     """Leave frames with missing light out of sums, and list the dark ones."""
     numbers = np.concatenate([np.arange(*windows.frames_before), np.arange(*windows.frames_after)])
     power = windows.power
@@ -112,23 +112,22 @@ def without_cut_off(movie: Stack, camera: Camera, windows: Windows) -> tuple[Sta
     ], dtype=np.int64)  # fmt: skip
     missing = np.union1d(cut, numbers[~well_lit(power, DARK)])
     if not missing.size:
-        return movie, ""
-    one = missing.size == 1
-    message = (
-        f"{movie.name}: frame{'' if one else 's'} {listed(missing, _NAMED)} of {numbers.size} "
-        f"{'is' if one else 'are'} dark or cut off (behind a shutter, or lost by the camera), and "
-        f"{'is' if one else 'are'} left out"
-    )
+        return movie, None
+    values: dict[str, float | str] = {
+        "frames": frames_listed(missing),
+        "of": numbers.size,
+        "are": are(missing.size),
+    }
+    finding = FRAMES_DARK(values, where=movie.name)
     if cut.size:
         dark = np.broadcast_to(np.floor(camera.offset_adu), movie.shape[1:]).astype(movie.dtype)
         movie = movie.seen_as(_DarkFramesReplaced(movie, cut, dark))
-    return movie, message
+    return movie, finding
 
 
 IntArray = NDArray[np.int64]
 
 _READ = 64  # frames at a time
-_NAMED = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +138,7 @@ class KeptFrames:
     config: Config
     configured: Config
     numbers: IntArray | None = None
-    message: str = ""
+    finding: Finding | None = None
 
     def put_back(self, found: DetectionResult) -> DetectionResult:
         """Give what was found the numbers of the file, and the ranges that were configured."""
@@ -188,13 +187,14 @@ def without_repeats(movie: Stack, config: Config, camera: Camera) -> KeptFrames:
         background = background.model_copy(update={"frames": (0, middle)})
     fit = fit.model_copy(update={"frames": (middle, numbers.size)})
     own = config.model_copy(update={"background": background, "fit": fit})
-    many = missing.size > 1
-    message = (
-        f"{movie.name}: {'frames' if many else 'frame'} {listed(missing.tolist(), _NAMED)} of "
-        f"{used.size} {'repeat' if many else 'repeats'} the frame before (stuck in the camera), "
-        f"and {'are' if many else 'is'} left out"
-    )
-    return KeptFrames(movie.seen_as(StackFrames(movie, numbers)), own, config, numbers, message)
+    repeat = "repeats" if missing.size == 1 else "repeat"
+    values: dict[str, float | str] = {
+        "frames": frames_listed(missing),
+        "of": used.size,
+        "repeat": repeat,
+    }
+    finding = REPEATS_LEFT_OUT({**values, "are": are(missing.size)}, where=movie.name)
+    return KeptFrames(movie.seen_as(StackFrames(movie, numbers)), own, config, numbers, finding)
 
 
 def _repeats(movie: Stack, camera: Camera, span: tuple[int, int]) -> BoolArray:

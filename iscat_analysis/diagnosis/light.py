@@ -18,12 +18,13 @@ from iscat_analysis.camera import (
     find_lines,
     find_surface,
     find_unsteady,
-    unsteady_message,
+    unsteady_finding,
     whole_frames,
 )
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES
 from iscat_analysis.diagnosis.recognise import least_beside, spot_of
+from iscat_analysis.findings import Finding
 from iscat_analysis.fitting.ranges import background_mode
 from iscat_analysis.movie import Stack
 from iscat_analysis.search.frames import good_frames, measure_frames, well_lit
@@ -62,16 +63,16 @@ class JudgedLight:
 
     movie: Stack
     lines: Lines | None
-    messages: tuple[str, ...]
+    findings: tuple[Finding, ...]
     steady: Stack
 
 
 def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
     """Find pixels and parts of the light that are unsteady."""
-    if config.optics.scheme == "darkfield":
+    if not config.optics.interferes:
         return JudgedLight(movie, None, (), movie)
     pairs, window = _pairs(movie, config, camera)
-    messages = []
+    findings: list[Finding] = []
     optics, pixel_nm = config.optics, config.camera.pixel_size_nm
     spot = spot_of(optics.wavelength_nm, optics.na, pixel_nm or optics.wavelength_nm / optics.na)
     odd = find_unsteady(_apart(pairs), camera, least_beside(spot))
@@ -80,12 +81,12 @@ def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
         for part in (part for pair in pairs for part in (pair.before, pair.after)):
             part[:, odd] = dark
         movie = movie.without(odd, dark)
-        messages.append(unsteady_message(odd))
+        findings.append(unsteady_finding(odd, movie.name))
     lines = judge_lines(movie, config, camera, pairs, window)
     if lines is None:
-        return JudgedLight(movie, None, tuple(messages), movie)
+        return JudgedLight(movie, None, tuple(findings), movie)
     steady = movie.seen_as(SteadyFrames(movie, lines, camera))
-    return JudgedLight(movie, lines, (*messages, *lines.messages), steady)
+    return JudgedLight(movie, lines, (*findings, *lines.findings(movie.name)), steady)
 
 
 def judge_lines(
@@ -98,7 +99,7 @@ def judge_lines(
         not background.power_normalization
         or background.method == "known"
         or (background.method == "sliding" and background.follows_pattern)
-        or (mode == "tracks" and config.track.free == "joint")
+        or (mode == "tracks" and config.track.heights_free)
     ):
         return None
     first, last = background.recorded or config.fit.frames or (0, movie.shape[0])

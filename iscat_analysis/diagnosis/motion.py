@@ -15,6 +15,9 @@ import numpy as np
 from iscat_analysis.camera import Camera, follow_pattern
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import NoiseSurvey, first_counts, is_lit
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.camera import PATTERN_MOVED
+from iscat_analysis.medians import SIGMA_PER_MAD
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import FloatArray, Windows
 from iscat_analysis.search.frames import good_frames, well_lit
@@ -30,7 +33,7 @@ def with_drift_correction(config: Config, *, moves: bool) -> Config:
     return config.model_copy(update={"background": background})
 
 
-def motion_message(opening: NoiseSurvey) -> str:
+def motion_in(opening: NoiseSurvey) -> str:
     """Say that the fixed pattern of a landing movie moves; empty where it does not."""
     if opening.noise.shakes:
         return "the fixed pattern shakes"
@@ -57,7 +60,6 @@ _NOISE_BYTES = 64_000_000  # of counts on which the noise is measured
 _LONGEST = 100  # average of the noise curve
 _SMALLEST_PX = 32  # side of a field in which a pattern is followed, and of its parts
 _FEWEST_PARTS = 4  # whose differences tell an error
-_NORMAL_QUARTILE = 0.6745
 _SIGNIFICANT = 4.0  # standard errors beyond which a drift is one
 
 
@@ -103,7 +105,7 @@ def _pattern_moved(windows: Windows) -> tuple[FloatArray, FloatArray] | None:
     shifts = np.array([part[0] for part in parts if part is not None])
     if len(shifts) < _FEWEST_PARTS:
         return whole
-    apart = np.median(np.abs(shifts - np.median(shifts, axis=0)), axis=0) / _NORMAL_QUARTILE
+    apart = SIGMA_PER_MAD * np.median(np.abs(shifts - np.median(shifts, axis=0)), axis=0)
     return whole[0], np.maximum(whole[1], apart * math.sqrt(math.pi / 2 / len(shifts)))
 
 
@@ -126,16 +128,12 @@ def _part_moved(
     return motion.shift_px[1], motion.error_px[1]
 
 
-def drift_warning(name: str, background: dict[str, Any]) -> str | None:
-    """Warn that the fixed pattern moved, where that can be taken for particles."""
+def drift_warning(name: str, background: dict[str, Any]) -> Finding | None:
+    """Find whether the fixed pattern moved, where its edges can be taken for particles."""
     if background["drift_px"] is None:
         return None
     (y, x), (y_error, x_error) = background["drift_px"], background["drift_error_px"]
     pull = math.hypot(y / y_error, x / x_error)
     if math.hypot(y, x) <= DRIFT_PX or pull <= _SIGNIFICANT:
         return None
-    return (
-        f"{name}: the fixed pattern moved by {x:+.2f} pixels in x and {y:+.2f} in y between the "
-        "background and the frames after it; its edges look like particles: take background frames "
-        "nearer to them (background.frames), or fewer frames (fit.frames)"
-    )
+    return PATTERN_MOVED({"x_px": x, "y_px": y}, where=name)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from iscat_analysis.camera import (
+    SIGMAS,
     TOLERANCE,
     Camera,
     FieldSample,
@@ -34,6 +35,18 @@ from iscat_analysis.camera import (
 )
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.findings import Finding, existing
+from iscat_analysis.findings.camera import (
+    COUNTS_BENT,
+    COUNTS_BENT_OR,
+    FRAMES_FILTERED,
+    GAIN_BESIDE_OFFSET,
+    OFFSET_OR_GAIN,
+    OFFSET_WRONG,
+    READ_NOISE_LACKING,
+    ROOM_LIGHT,
+    WINDOWS_NOISY,
+)
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, FrameSource, Windows
@@ -53,7 +66,7 @@ from iscat_analysis.threads import one_thread_algebra
 _LEAST_NOISE_ERROR = 0.03
 _MOST_LEFT = 1.1  # of the noise that the light has, with an offset that the noise alone tells
 REPORTED_LAWS = ("other light", "read noise")
-"""Laws by which noise is not what the camera's numbers predict, as `law_messages` has it."""
+"""Laws by which noise is not what the camera's numbers predict, as `law_finding` has it."""
 
 _OTHERS = {
     "offset": "an offset that is too high",
@@ -61,7 +74,6 @@ _OTHERS = {
     "noisy light": "light that is noisy by itself",
     "other light": "light that does not follow the laser",
 }
-_SUBTRACTED_SIGMAS = 4.0  # standard errors below no counts, where no camera has its offset
 
 
 def zero_by_law(law: Law, level_e: float) -> LightZero | None:
@@ -71,59 +83,43 @@ def zero_by_law(law: Law, level_e: float) -> LightZero | None:
     return LightZero(0.0, law.se, 0.0, law.flickers) if law.kind == "linear" else None
 
 
-def law_messages(known: LearnedCamera) -> tuple[str, ...]:
-    """Say that counts are not proportional to light, which law they follow, and what to do."""
+def law_finding(known: LearnedCamera, name: str) -> Finding | None:
+    """Find counts that are not proportional to light, and which law they follow."""
     law = known.camera.law
     if law is None:
-        return ()
+        return None
+    share = {"percent": 100 * law.value, "percent_se": 100 * law.se}
     if law.kind == "read noise" and law.value > TOLERANCE:
-        return (
-            f"without light the noise is {100 * law.value:.2g} ± {100 * law.se:.1g} % of the "
-            "light's variance beyond what camera.read_noise_e says: it lacks "
-            f"{math.sqrt(law.value * known.level_e):.3g} e, in squares; record a dark",
-        )
+        lacking = math.sqrt(law.value * known.level_e)
+        return READ_NOISE_LACKING({**share, "lacking_e": lacking}, where=name)
     if not (law.bent or (law.kind == "other light" and law.dilutes)):
-        return ()
-    seen = (
-        "the noise and the answer to the laser's power grow" if law.flickers else "the noise grows"
-    )
+        return None
     effect = f"{_effect(1 - law.contrast)} (± {100 * law.contrast_se:.2g} %)"
-    flagged = "all rows are flagged nonlinear"
     if law.kind == "other light":
-        camera, share = known.config, law.value
-        counts = share * known.level_e / float(np.mean(known.camera.gain_e_per_adu))
+        camera, light_e = known.config, law.value * known.level_e
+        counts = light_e / float(np.mean(known.camera.gain_e_per_adu))
         advice = ""
         if not isinstance(camera.offset_adu, str) and not isinstance(camera.read_noise_e, str):
-            read = math.hypot(camera.read_noise_e, math.sqrt(share * known.level_e))
+            read = math.hypot(camera.read_noise_e, math.sqrt(light_e))
             advice = (
                 f", or set camera.offset_adu = {camera.offset_adu + counts:.5g} and "
                 f"camera.read_noise_e = {read:.4g}, which is its shot noise"
             )
-        return (
-            f"{100 * share:.2g} ± {100 * law.se:.1g} % of the light does not follow the laser's "
-            "power but has its shot noise, as light of the room, which interferes with nothing; it "
-            f"makes {effect}; {flagged}: put it out{advice}",
-        )
-    named = {
+        return ROOM_LIGHT({**share, "effect": effect, "advice": advice}, where=name)
+    both = "the noise and the answer to the laser's power grow"
+    grows = both if law.flickers else "the noise grows"
+    words = {
         "gamma": f"gamma {law.value:.3g} ± {law.se:.1g} (counts as light to this power)",
         "saturation": "soft saturation (the pixels are filled to "
         f"{law.value:.3g} ± {law.se:.1g} of the light at which they saturate)",
-    }
+    }[law.kind]
     if law.certain:
         more = f" besides an offset of {100 * law.offset:.2g} % of the light" if law.offset else ""
-        return (
-            f"the counts are not in proportion to the light: {seen} with it as by "
-            f"{named[law.kind]}{more}, which makes {effect}; {flagged}: switch it off or lower the "
-            "exposure, or correct this movie with camera.response = response.csv, which is written "
-            "with the result",
-        )
+        values = {"grows": grows, "law": f"{words}{more}", "effect": effect}
+        return COUNTS_BENT(values, where=name)
     others = " or ".join(_OTHERS.get(kind, kind) for kind in law.alike)
-    return (
-        f"the counts are not in proportion to the light: {seen} with it as by {named[law.kind]}, "
-        f"and the movie does not tell this from {others}; "
-        f"the first makes {effect}; {flagged}: switch gamma off and lower the exposure; "
-        "`iscat calibrate camera` with a dark tells them apart",
-    )
+    values = {"grows": grows, "law": words, "others": others, "effect": effect}
+    return COUNTS_BENT_OR(values, where=name)
 
 
 def offset_is_wrong(zero: LightZero, gain: GainDiagnosis) -> bool:
@@ -153,32 +149,32 @@ def _effect(share: float) -> str:
     return f"masses {percent:g} % too {'small' if share > 0 else 'large'}"
 
 
-def offset_message(zero: LightZero, camera: Camera) -> str:
-    """Say where the light is zero, and what a wrong offset does to masses."""
-    per_count = float(np.mean(camera.gain_e_per_adu))
-    counts = zero.electrons / per_count
+def offset_finding(zero: LightZero, camera: Camera) -> Finding:
+    """Tell where the light is zero, and what a wrong offset does to masses."""
+    counts = zero.electrons / float(np.mean(camera.gain_e_per_adu))
     se = zero.se * counts / zero.share
     found = float(np.mean(camera.offset_adu)) + counts
-    how = "pixels follow the laser's power" if zero.flickers else "the noise grows with the light"
-    read = zero.electrons < 0 and not zero.flickers
-    message = (
-        f"{_offset_of(camera)} is too {'low' if zero.share > 0 else 'high'} by {abs(counts):.4g} ± "
-        f"{se:.2g} counts, as {how}, and makes {_effect(zero.share)}: "
-    )
     if np.ndim(camera.offset_adu):
-        message += "record a dark for `iscat calibrate camera --maps`"
-    elif found < -_SUBTRACTED_SIGMAS * se:
-        message += "see whether counts were subtracted from the movie; record raw counts"
+        advice = "record a dark for `iscat calibrate camera --maps`"
+    elif found < -SIGMAS * se:  # no camera has its offset below no counts
+        advice = "see whether counts were subtracted from the movie; record raw counts"
     else:
-        message += f"set camera.offset_adu = {max(found, 0.0):.4g}, or the mean of a dark"
-    if read:
+        advice = f"set camera.offset_adu = {max(found, 0.0):.4g}, or the mean of a dark"
+    if zero.electrons < 0 and not zero.flickers:
         missing = math.sqrt(-zero.electrons)
-        message += f" (unless {missing:.3g} e of read noise are missing in camera.read_noise_e)"
-    return message
+        advice += f" (unless {missing:.3g} e of read noise are missing in camera.read_noise_e)"
+    how = "pixels follow the laser's power" if zero.flickers else "the noise grows with the light"
+    return OFFSET_WRONG({
+        "offset": _offset_of(camera), "way": "low" if zero.share > 0 else "high",
+        "counts": abs(counts), "counts_se": se, "how": how, "effect": _effect(zero.share),
+        "advice": advice,
+    })  # fmt: skip
 
 
-def offset_or_gain_message(gain: GainDiagnosis, zero: LightZero | None, camera: Camera) -> str:
-    """Say that either the offset or the gain may be wrong, where the noise fits both.
+def offset_or_gain_finding(
+    gain: GainDiagnosis, zero: LightZero | None, camera: Camera
+) -> Finding | None:
+    """Find that either the offset or the gain may be wrong, where the noise fits both.
 
     An offset that is wrong by a share s of the light leaves 1 − s of the expected noise.
     """
@@ -187,18 +183,14 @@ def offset_or_gain_message(gain: GainDiagnosis, zero: LightZero | None, camera: 
         gain.shakes
         or gain.noise_counts < 1
         or abs(share) < _LEAST_NOISE_ERROR + 3 * gain.noise_ratio_se
+        or (zero is not None and not zero.may_be(share))
     ):
-        return ""
-    if zero is not None and not zero.may_be(share):
-        return ""
-    noisy = "by light that is noisy by itself, " if gain.noise_ratio > 1 else ""
-    return (
-        f"the noise variance is {gain.noise_ratio:.3g} ± {gain.noise_ratio_se:.1g} times what the "
-        "camera's numbers predict, and this movie does not tell whether by the gain (then set "
-        f"camera.gain_e_per_adu = {gain.gain_e_per_adu:.4g}), {noisy}or by {_offset_of(camera)}, "
-        f"which would make {_effect(share)}: record a dark, and measure both with "
-        "`iscat calibrate camera`"
-    )
+        return None
+    return OFFSET_OR_GAIN({
+        "ratio": gain.noise_ratio, "ratio_se": gain.noise_ratio_se,
+        "measured": gain.gain_e_per_adu, "offset": _offset_of(camera), "effect": _effect(share),
+        "noisy": "by light that is noisy by itself, " if gain.noise_ratio > 1 else "",
+    })  # fmt: skip
 
 
 def allow_for_correlation(gain: GainDiagnosis, spectrum: NoiseSpectrum | None) -> GainDiagnosis:
@@ -238,17 +230,17 @@ _MOST_NOISE_SHARE = 0.75  # of the noise, which small pictures leave over by cha
 class Noise:
     """The noise of frames without particles, compared with the camera's numbers."""
 
-    messages: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     differs: bool = False
     excess: ExcessNoise | None = None
     spectrum: NoiseSpectrum | None = None
     shakes: bool = False
 
-    def messages_of(self, name: str) -> Iterator[str]:
-        """List the messages for the user."""
-        if self.spectrum is not None and self.spectrum.message:
-            yield f"{name}: {self.spectrum.message}"
-        yield from self.messages
+    def findings_of(self, name: str) -> list[Finding]:
+        """List what the user should know, that of the spectrum first."""
+        found = None if self.spectrum is None else self.spectrum.finding
+        spectral = [] if found is None else [replace(found, where=name)]
+        return [*spectral, *self.findings]
 
     def compared_with_fits(self, chi2: FloatArray) -> Noise:
         """Withdraw an excess of noise that the fits of particles do not show.
@@ -299,7 +291,9 @@ def judge_counts(
         return judge_counts(still, camera, masked=masked, additive=additive, whole=whole)
     shared = shared_light(counts, camera, masked=masked)
     if shared is not None:
-        return Noise((_filtered(shared),), True)  # the spectrum is that of neighbours as well
+        return Noise(
+            (FRAMES_FILTERED({"shared": shared}),), True
+        )  # the spectrum is that of neighbours as well
     law = camera.law
     if law is not None and (law.bent or law.kind in REPORTED_LAWS):  # already
         excess = ExcessNoise(gain.noise_ratio, "") if gain.off and gain.noise_ratio > 1 else None
@@ -313,33 +307,27 @@ def judge_counts(
         zero = None  # the variance of a pixel is then of its neighbours' light as well
     wrong = zero if zero is not None and offset_is_wrong(zero, gain) else None
     if wrong is not None:
-        message = offset_message(wrong, camera)
+        finding: Finding | None = offset_finding(wrong, camera)
     else:
-        message = "" if additive else offset_or_gain_message(gain, zero, camera)
-        message = message or gain.message or ""
-    if gain.shakes and follows is False:
-        message += ", or set background.drift_correction = true, with which it is followed"
+        finding = None if additive else offset_or_gain_finding(gain, zero, camera)
+        finding = finding or gain.finding
+    if finding is not None and gain.shakes and follows is False:
+        follow = ", or set background.drift_correction = true, with which it is followed"
+        finding = replace(finding, values={**finding.values, "follow": follow})
+    message = "" if finding is None else finding.text
     excess = ExcessNoise(gain.noise_ratio, message) if gain.off and gain.noise_ratio > 1 else None
     if wrong is None:
-        return Noise((message,) if message else (), gain.off, excess, spectrum, gain.shakes)
-    messages = [message]
+        return Noise(tuple(existing([finding])), gain.off, excess, spectrum, gain.shakes)
+    further: Finding | None = None
     moved = replace(
         camera, offset_adu=camera.offset_adu + wrong.electrons / camera.gain_e_per_adu, law=None
     )
     with contextlib.suppress(DataError):  # too dark to tell
         rest = diagnose_gain(counts[:_GAIN_FRAMES], moved, masked=masked)
         rest = allow_for_correlation(rest, measure_spectrum(counts, moved, masked=masked))
-        messages += [f"with that offset, {rest.message}"] if rest.message else []
-    return Noise(tuple(messages), True, excess, spectrum)
-
-
-def _filtered(shared: float) -> str:
-    """Say that successive frames are not independent measurements."""
-    return (
-        f"frames next to each other differ by {shared:.2g} times the variance of those farther "
-        "apart: they were averaged, interpolated or filtered in time, so that their noise does not "
-        "tell the gain, landings are blurred and σ may be too small: record or export raw frames"
-    )
+        if rest.finding is not None:
+            further = GAIN_BESIDE_OFFSET({"text": rest.finding.text})
+    return Noise(tuple(existing([finding, further])), True, excess, spectrum)
 
 
 def judge_background(
@@ -384,7 +372,7 @@ def judge_beside(
         if free.any() and free.sum() >= _LEAST_FREE_SHARE * used.sum():
             counts = movie.read(span[0], span[0] + count)
             additive = context.additive
-            if judge_counts(counts, camera, masked=~free, additive=additive).messages:
+            if judge_counts(counts, camera, masked=~free, additive=additive).findings:
                 counts = camera.to_counts(without(count))
                 return judge_counts(counts, camera, masked=~free, additive=additive)
             return Noise()
@@ -408,7 +396,7 @@ class NoiseSurvey:
 
 def survey_noise(reader: Reader, config: Config) -> NoiseSurvey:
     """Judge the noise of a landing movie, and choose the window."""
-    additive = config.optics.scheme == "darkfield"
+    additive = not config.optics.interferes
     judged, field = reader.sampled, FieldSample.of(reader.shape)
     sample: dict[str, Any] | None = None
     with one_thread_algebra():
@@ -425,11 +413,7 @@ def survey_noise(reader: Reader, config: Config) -> NoiseSurvey:
         )  # fmt: skip
     if noise.excess is None:
         ratio = curve.at(window)
-        message = (
-            f"averages of {window} frames differ by {ratio:.2g} times the variance of the light: "
-            "by drift or the laser (set background.drift_correction = true), or by the rings of "
-            "many bright particles; lower background.window_frames, which helps against all"
-        )
+        message = WINDOWS_NOISY({"window": window, "ratio": ratio}).text
         noise = replace(noise, excess=ExcessNoise(ratio, message))
     return NoiseSurvey(reader, noise, curve, window, sample)
 

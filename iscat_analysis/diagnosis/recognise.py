@@ -29,7 +29,9 @@ from scipy.special import bdtrc
 
 from iscat_analysis.camera import Camera, sampled
 from iscat_analysis.config import Config
-from iscat_analysis.medians import middle
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.camera import PARTICLES_LAND, PARTICLES_MOVE
+from iscat_analysis.medians import SIGMA_PER_MAD, middle
 from iscat_analysis.records import CountSource, FloatArray
 from iscat_analysis.search.bright import smoothed, spot_response
 from iscat_analysis.search.frames import summed
@@ -50,7 +52,6 @@ _LEAST_NOISE_RATIO = 1.5
 _LEAST_NEIGHBOUR_SHARE = 0.5
 _NOISE_SIGMAS = 4.0  # standard deviations of noise
 _SPOT_SIGMA = 0.21  # standard deviation of a spot, in wavelengths over NA
-_SIGMA_PER_MAD = 1.4826  # standard deviation of a normal law over its median deviation
 _REACH_SIGMAS = 4.5  # standard deviations of a spot, within which a picture is looked at
 _AROUND = 2  # blocks on either side that are looked at
 _LEAST_BLOCKS = 5
@@ -82,7 +83,7 @@ def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
     between = narrow - wide
     for image, out in zip(blocks, smooth, strict=True):
         out[:] = smoothed(image - 1, between)  # whose noise single precision holds
-    noise = _SIGMA_PER_MAD * _median_deviation(smooth[:-1], smooth[1:])
+    noise = SIGMA_PER_MAD * _median_deviation(smooth[:-1], smooth[1:])
     size = smooth[3:-1] - smooth[1:-3]
     np.abs(size, out=size)
     apart = round(2 * _REACH_SIGMAS * spot_px)
@@ -136,7 +137,7 @@ def _of_spots(
 
 
 def _median_deviation(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
-    """Median deviation from the median of what other has more than one, of some values all over."""
+    """Median absolute deviation of other − one, on a subsample of pixels."""
     every = 1 + one.size // _MOST_VALUES
     some = other.ravel()[::every] - one.ravel()[::every]
     deviation = some - middle(some.copy())
@@ -220,27 +221,21 @@ def _damping(light_e: FloatArray, camera: Camera) -> NDArray[np.float32]:
     return np.minimum(sharp / enough, 1.0).astype(np.float32)
 
 
-def as_landing(changes: Changes, name: str) -> str:
-    """Say that a movie in mode ``track`` shows landings; empty where it does not."""
+def as_landing(changes: Changes, name: str) -> Finding | None:
+    """Find whether a movie in mode ``track`` shows landings."""
     if _chance(changes.number, changes.staying, MOST_STAYING) > LARGEST_CHANCE:
-        return ""
-    return (
-        f"{name}: its particles land or leave rather than move: of {changes.number} clear changes "
-        f"{100 * changes.staying:.0f} % stay as they are; use "
-        'fit.mode = "mass" without background.frames, whose windows follow landings'
-    )
+        return None
+    values = {"changes": changes.number, "percent": 100 * changes.staying}
+    return PARTICLES_LAND(values, where=name)
 
 
-def as_moving(changes: Changes, name: str) -> str:
-    """Say that a movie with sliding windows shows moving particles; empty where it does not."""
+def as_moving(changes: Changes, name: str) -> Finding | None:
+    """Find whether a movie with sliding windows shows moving particles."""
     clear = _chance(changes.number, changes.moving, MOST_MOVING) <= LARGEST_CHANCE
     if not (clear and changes.moving >= LEAST_MOVING):
-        return ""
-    return (
-        f"{name}: its particles move rather than land: around {100 * changes.moving:.0f} % of "
-        f"{changes.number} clear changes the picture is another one every {BLOCK} frames, as of "
-        'what goes from place to place; use fit.mode = "track", which follows them'
-    )
+        return None
+    values = {"changes": changes.number, "percent": 100 * changes.moving, "block": BLOCK}
+    return PARTICLES_MOVE(values, where=name)
 
 
 def _chance(number: int, share: float, most: float) -> float:

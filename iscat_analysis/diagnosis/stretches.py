@@ -20,6 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.camera import MOVIE_BREAKS
+from iscat_analysis.medians import SIGMA_PER_MAD
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.noise import SHORTEST_MOVIE
@@ -41,7 +44,6 @@ _SAME, _LIKE, _OTHER = 0.99, 0.9, 0.5  # correlation of patterns: one, alike, an
 _BRIGHTER, _FLATTER = 1.03, 0.985  # light and contrast of a pattern under more light
 _MOST_BREAKS = 12  # beyond which nothing is usual
 _LONG = 0.75  # of the longest stretch, from where a part tells as much as that
-_NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
 
 
 @dataclass(frozen=True)
@@ -86,16 +88,13 @@ class Stretches:
         span = min(self.kept[0][0], every[0].start), max(self.kept[-1][1], every[-1].stop)
         return _between(span, every) or self
 
-    def message(self, name: str) -> str:
-        """Say where the movie breaks; empty where it does not."""
+    def finding(self, name: str) -> Finding | None:
+        """Tell where the movie breaks."""
         if not self.breaks:
-            return ""
-        parts = ", ".join(f"{a}:{b}" for a, b in self.kept)
+            return None
+        kept = ", ".join(f"{a}:{b}" for a, b in self.kept)
         breaks = "; ".join(one.description for one in self.breaks)
-        return (
-            f"{name}: {breaks}: frames before and after are not compared with each other, and "
-            f"{parts} are analysed"
-        )
+        return MOVIE_BREAKS({"breaks": breaks, "kept": kept}, where=name)
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -216,7 +215,7 @@ def _runs(cells: FloatArray) -> list[tuple[int, int]]:
     usable = seen.min(axis=0) > 0
     change = np.diff(np.log(np.where(usable, seen, 1.0)), axis=0)
     change -= np.median(change, axis=0)
-    scatter = _NORMAL * np.median(np.abs(change), axis=0)
+    scatter = SIGMA_PER_MAD * np.median(np.abs(change), axis=0)
     usable &= scatter > 0
     if not usable.any():
         return []

@@ -8,6 +8,7 @@ that stand in the sentence.  One place prints them, the page sorts them by sever
 
 from __future__ import annotations
 
+from iscat_analysis.findings import camera, files
 from iscat_analysis.findings.registry import (
     KINDS,
     Finding,
@@ -24,6 +25,6 @@ from iscat_analysis.findings.registry import (
 )
 
 __all__ = [
-    "KINDS", "Finding", "FindingKind", "Findings", "Severity", "aside", "define", "existing",
-    "printing", "remark", "unreported", "warnings_in",
+    "KINDS", "Finding", "FindingKind", "Findings", "Severity", "aside", "camera", "define",
+    "existing", "files", "printing", "remark", "unreported", "warnings_in",
 ]  # fmt: skip

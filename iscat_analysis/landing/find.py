@@ -85,7 +85,7 @@ def frame_warnings(
                 f"{name}: the brightness jumps at {_frames(jumps)} by up to {largest:+.0f} %; "
                 "it is divided out, but look at the laser and at events in these frames"
             )
-    yield from pixel_warnings(*merged.masks())
+    yield from (finding.text for finding in pixel_warnings(*merged.masks()))
     yield from _drift_warnings(name, merged, drift, light.size / window, corrected)
 
 
@@ -226,8 +226,8 @@ def analyse_landings(
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
     opening = survey_over(frames, config, camera, (first, last), opening)
     reader, noise, window = opening.reader, opening.noise, opening.window
-    for text in noise.messages_of(movie.name):
-        warn(text)
+    for finding in noise.findings_of(movie.name):
+        warn(finding.text)
     stride = stride_of(window)
     count = sum(boundaries(stop - start, window) for start, stop in stretches)
     posterior = config.samples_posterior

@@ -25,6 +25,8 @@ from iscat_analysis.diagnosis import (
     uneven_warning,
     without_cut_off,
 )
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.camera import MODEL_MISFITS
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import (
     Event,
@@ -83,8 +85,7 @@ def find_before_after(ready: Prepared, run: Run) -> DetectionResult:
                 doubt=doubt, warn=run.warn,
             )  # fmt: skip
             if not windows.n_before:
-                for text in _judge_beside_particles(ready, context, windows, found.fits).messages:
-                    run.warn(text)
+                run.report(*_judge_beside_particles(ready, context, windows, found.fits).findings)
         else:
             found = _fit_together(ready, run, context, windows, noise, summary, pool)
     run.clock.lap("results")
@@ -102,9 +103,8 @@ def _sum_frames(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
     windows = sums(ready.steady)
     if config.optics.scheme == "darkfield":
         return ready, windows
-    movie, message = without_cut_off(ready.steady, camera, windows)
-    if message:
-        run.warn(message)
+    movie, finding = without_cut_off(ready.steady, camera, windows)
+    run.report(finding)
     if movie is ready.steady:
         return ready, windows
     return replace(ready, steady=movie), sums(movie)
@@ -129,22 +129,19 @@ def _background(
         context = make_context(
             config, ready.shape, searches=searches, noise=noise.spectrum, lines=ready.lines
         )
-    for text in (*noise.messages_of(movie.name), *pixel_warnings(*windows.left_out)):
-        run.warn(text)
-    uneven = "" if still else uneven_warning(config, movie.name, windows)
-    for text in ("" if still else repeats_warning(movie, windows), uneven):
-        if text:
-            run.warn(text)
+    run.report(*noise.findings_of(movie.name), *pixel_warnings(*windows.left_out))
+    uneven = None if still else uneven_warning(config, movie.name, windows)
+    run.report(None if still else repeats_warning(movie, windows), uneven)
     summary: dict[str, Any] = {}
-    moved = ""
+    moved = None
     if not context.additive:
         summary = examine_background(movie, camera, windows)
         summary["noise_spectrum"] = noise.summary
-        moved = drift_warning(movie.name, summary) or ""
-        if moved:
-            run.warn(moved)
+        moved = drift_warning(movie.name, summary)
+        run.report(moved)
     run.clock.lap("background")
-    return context, noise, summary, uneven or moved
+    doubt = uneven or moved
+    return context, noise, summary, "" if doubt is None else doubt.text
 
 
 def _judge_beside_particles(
@@ -195,9 +192,8 @@ def _fit_together(
     run.clock.lap("fit")
     # rings of many particles that a wrong microscope leaves over look uneven too
     cause = misfit_warning(context.config, events)
-    cause = cause or _uneven_message(context, ready.steady.name, windows, events)
-    if cause:
-        run.warn(cause)
+    misfit = MODEL_MISFITS({"cause": cause}) if cause else None
+    run.report(misfit or _uneven_finding(context, ready.steady.name, windows, events))
     repeats, empty = field_repeats(context, ready.steady, ready.camera, windows, events)
     if context.config.fit.sigma != "measured":
         events, changing = _flag_changing_masses(context.mode, events, repeats)
@@ -231,12 +227,12 @@ def _fit_together(
     )
 
 
-def _uneven_message(
+def _uneven_finding(
     context: AnalysisContext, name: str, windows: Windows, events: Sequence[Event]
-) -> str:
-    """Say that a known background is uneven, where no particle was fitted."""
+) -> Finding | None:
+    """Find that a known background is uneven, where no particle was fitted."""
     if windows.n_before:
-        return ""
+        return None
     rows, columns = windows.after_e.shape
     field, signal = Region((0, rows), (0, columns)), np.zeros(windows.after_e.shape)
     optics = context.config.optics

@@ -211,20 +211,19 @@ def make_analysis(
             further[name] = finding.summary
             if finding.message:
                 run.warn(finding.message)
-    for doubt in (
+    sliding = ready.background_mode == "sliding"
+    window = found.summary["window_frames"] if sliding and found.summary else None
+    run.report(
         scale_warning(scale),
         line_warning(config, table),
         nonlinearity_warning(scale, table),
         sign_warning(config, table),
         large_warning(config, table),
-        reference_warning(config, table),
-        landing_rate_warning(table) if ready.background_mode == "sliding" else "",
-        residue_warning(table, found.summary["window_frames"])
-        if ready.background_mode == "sliding" and found.summary
-        else "",
-    ):
-        if doubt:
-            run.warn(doubt)
+        landing_rate_warning(table) if sliding else None,
+        None if window is None else residue_warning(table, window),
+    )
+    if reference := reference_warning(config, table):
+        run.warn(reference)
     scaled = config.fit.sigma == "measured"
     if found.repeats:
         seen = rows.fluctuation is not None and rows.fluctuation.is_seen
@@ -258,9 +257,7 @@ def make_analysis(
         further |= track_summary
         for text in warnings_of(table, config.camera.frame_rate_hz, ticks):
             run.warn(text)
-        height_warning = fixed_height_warning(config, table)
-        if height_warning:
-            run.warn(height_warning)
+        run.report(fixed_height_warning(config, table))
         backgrounds = followed.parts or (followed.windows,)
         films = make_films(context, ready.steady, ready.camera, backgrounds, table, tracks)
         run.clock.lap("tracks")

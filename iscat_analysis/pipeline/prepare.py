@@ -18,7 +18,7 @@ from iscat_analysis.diagnosis import (
     look_at_changes,
 )
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.findings import Finding, remark
+from iscat_analysis.findings import Finding, existing, remark
 from iscat_analysis.fitting.ranges import tracked_frames
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.instrument.contrast_sign import learn_sign, wrong_sign
@@ -64,17 +64,17 @@ def optics(state: Prepared) -> tuple[Prepared, list[Finding]]:
             steady, _with_standards(configured, state), camera,
             warn=texts.append, notify=state.notify, opening=state.opening,
         )  # fmt: skip
-    changes, stretches = state.changes, state.stretches
+    changes, stretches, breaks = state.changes, state.stretches, None
     if changes is not None and config.optics.na != configured.optics.na:
         changes = start_in_thread(look_at_changes, steady, config, camera, state.span)
     if state.background_mode == "sliding" and config.optics.focus_jumps:
         jumps = [frame for frame, rise in config.optics.focus_jumps if rise]
         stretches = stretches.with_jumps(jumps)
         if stretches is not state.stretches:
-            texts.append(stretches.message(steady.name))
+            breaks = stretches.finding(steady.name)
     summary = {**state.summary, **({"optics": learned} if learned else {})}
     state = replace(state, config=config, changes=changes, stretches=stretches, summary=summary)
-    return state, [remark(text) for text in texts]
+    return state, existing([*(remark(text) for text in texts), breaks])
 
 
 def kind(state: Prepared) -> tuple[Prepared, list[Finding]]:
@@ -84,8 +84,8 @@ def kind(state: Prepared) -> tuple[Prepared, list[Finding]]:
     changes = state.changes.result()
     other = (as_landing if state.tracked else as_moving)(changes, state.movie.name)
     summary = {**state.summary, "changes": changes_summary(changes)}
-    state = replace(state, other_kind=other, summary=summary)
-    return state, [remark(other)] if other else []
+    said = "" if other is None else other.text
+    return replace(state, other_kind=said, summary=summary), existing([other])
 
 
 STEPS: tuple[Step, ...] = (*LIGHT_STEPS, times, optics, kind)

@@ -113,7 +113,7 @@ def analyse_block(
         noise = judged.result().compared_with_fits(table["chi2_reduced"].to_numpy(float))
         smeared = smear_warning(context.config, table, moving.smear_nm)
         if smeared:  # what is left over of pictures, far around them, is not the camera's
-            noise = Noise(messages=(smeared,))
+            noise = Noise((smeared,))
     return Block(
         span=span,
         rows=replace(rows, frame=rows.frame + first),
@@ -127,7 +127,7 @@ def analyse_block(
         total_e=field.total_e,
         used=field.used,
         saturated=field.saturated,
-        noise=noise.messages,
+        noise=tuple(finding.text for finding in noise.findings),
         noise_differs=noise.differs,
         aligned=aligned,
     )

@@ -84,8 +84,8 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
     if message := plan.message(movie.name):
         run.warn(message)
     jitter_warning = jitter_future.result()
-    if jitter_warning:
-        run.warn(f"{movie.name}: {jitter_warning}")
+    if jitter_warning is not None:
+        run.report(replace(jitter_warning, where=movie.name))
     run.clock.lap("background")
     identity = ready.steady.identity if run.partial else ""
     shelves: list[BlockStore] = []
@@ -124,8 +124,7 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
     windows = joined.followed.windows
     for text in () if jitter_warning else blocks[0].noise:
         run.warn(text)
-    for text in pixel_warnings(*windows.left_out):
-        run.warn(text)
+    run.report(*pixel_warnings(*windows.left_out))
     if not len(joined.fits) and not interrupted:
         run.warn(f"{movie.name}: {_no_particle_message(context, blocks[0])}")
     run.clock.lap("track")

@@ -138,7 +138,7 @@ def test_metadata_fills_what_is_absent() -> None:
     assert resolved.camera.pixel_size_nm == 84.4
     assert resolved.camera.exposure_ms == 5.0
     assert resolved.camera.frame_rate_hz == 200.0
-    assert notes == ()
+    assert notes == []
     assert config.camera.pixel_size_nm is None
 
 
@@ -147,9 +147,10 @@ def test_the_configuration_wins_and_says_so() -> None:
     resolved, notes = resolve_metadata(config, StackMetadata(50.0, None, 102.0, source="imagej"))
     assert resolved.camera.pixel_size_nm == 84.4
     assert len(notes) == 2
-    assert notes[0].startswith("the pixel size is 84.4 nm in the configuration")
-    assert "50 nm in the movie's imagej metadata" in notes[0]
-    assert "frame rate" in notes[1]
+    assert [note.code for note in notes] == ["metadata-disagrees"] * 2
+    assert notes[0].text.startswith("the pixel size is 84.4 nm in the configuration")
+    assert "50 nm in the movie's imagej metadata" in notes[0].text
+    assert "frame rate" in notes[1].text
 
 
 @pytest.mark.parametrize("size_nm", [6.5e6, 6500.0, 0.0844])
@@ -164,7 +165,7 @@ def test_a_pixel_size_that_no_microscope_has_is_refused(size_nm: float) -> None:
 def test_pixels_larger_than_a_spot_are_named(size_nm: float, said: str) -> None:
     config = parse_config({"camera": {"pixel_size_nm": size_nm}})  # 525 nm, NA 1.42
     _, notes = resolve_metadata(config, StackMetadata())
-    assert [said in note for note in notes] == [True] * bool(said)
+    assert [said in note.text for note in notes] == [True] * bool(said)
 
 
 def test_pixels_twice_as_large_as_a_spot_are_refused_wherever_they_come_from() -> None:
@@ -307,15 +308,15 @@ def test_gain_is_measured(seed: int, gain: float) -> None:
 
 def test_the_message_names_the_remedy() -> None:
     camera = Camera(offset_adu=100.0)
-    message = diagnose_gain(recorded(1, gain=0.25), camera).message
-    assert message is not None
-    assert "times what camera.gain_e_per_adu = 1 predicts" in message
-    assert "unless the light itself is noisy" in message
-    assert float(message.rsplit(" = ")[-1]) == pytest.approx(0.25, rel=0.05)
-    message = diagnose_gain(recorded(1, gain=4.0), camera).message
-    assert message is not None
-    assert "noisy" not in message
-    assert diagnose_gain(recorded(1), camera).message is None
+    found = diagnose_gain(recorded(1, gain=0.25), camera).finding
+    assert found is not None
+    assert "times what camera.gain_e_per_adu = 1 predicts" in found.text
+    assert "unless the light itself is noisy" in found.remedy
+    assert float(found.remedy.rsplit(" = ")[-1]) == pytest.approx(0.25, rel=0.05)
+    found = diagnose_gain(recorded(1, gain=4.0), camera).finding
+    assert found is not None
+    assert "noisy" not in found.text
+    assert diagnose_gain(recorded(1), camera).finding is None
 
 
 def _pulls(trials: int, truth: float, **settings: float) -> np.ndarray:

@@ -23,7 +23,7 @@ from iscat_analysis.camera import (
     read_response,
 )
 from iscat_analysis.config import CameraConfig
-from iscat_analysis.diagnosis import law_messages
+from iscat_analysis.diagnosis import law_finding
 from iscat_analysis.movie import open_stack
 from iscat_analysis.records import StackMetadata
 
@@ -97,7 +97,7 @@ def test_eight_bits_have_no_offset_under_a_steady_laser() -> None:
         read = known.numbers["read_noise_e"]
         assert read.source == "rounding"
         assert read.value == pytest.approx(700 / 12**0.5, rel=0.02)
-        assert not law_messages(known)
+        assert law_finding(known, "") is None
 
 
 def test_gain_and_offset_are_learned_with_their_errors() -> None:
@@ -139,7 +139,7 @@ def test_what_the_driver_wrote_stands_where_it_is_not_measured() -> None:
     same = open_stack(np.repeat(counts[:1], 3, axis=0))
     one = learn_camera(same, CameraConfig(), (0, 3), metadata=wrote)
     assert one.numbers["gain_e_per_adu"].value == 0.46
-    assert not one.messages
+    assert not one.findings
 
 
 def test_particles_that_move_do_not_change_the_gain() -> None:
@@ -178,9 +178,10 @@ def test_averaged_frames_have_the_gain_of_their_averages() -> None:
 def test_a_steady_laser_does_not_tell_gamma_from_saturation() -> None:
     known = _learned(record(1, gamma(0.8), flicker=0.0))
     assert known.response is None
-    (said,) = law_messages(known)
-    assert "does not tell" in said
-    assert "camera.response" not in said
+    found = law_finding(known, "")
+    assert found is not None
+    assert found.code == "counts-bent-or"
+    assert "camera.response" not in found.text
 
 
 def test_the_curve_of_a_law_gives_back_the_light(tmp_path: Path) -> None:

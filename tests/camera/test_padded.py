@@ -54,9 +54,7 @@ def test_a_drivers_gain_is_per_count_of_the_camera(shift: int) -> None:
     measured = learn_camera(movie, CameraConfig(), (0, 40), metadata=replace(said, offset_adu=None))
     gain = measured.numbers["gain_e_per_adu"]
     assert abs(gain.value - GAIN / 2**shift) < 5 * gain.se
-    assert bool(measured.padding_message) == bool(shift)
-    if shift:
-        assert measured.padding_message.startswith(
-            "all counts are multiples of 16, as where 12 bits"
-        )
+    padding = measured.padding("m.tif")
+    assert (padding is not None) == bool(shift)
+    assert padding is None or padding.values == {"step": 16, "bits": 12}
     assert isinstance(measured.camera, Camera)

@@ -43,25 +43,25 @@ JOINT = make_config(fit={"mode": "track"}, track={"free": "joint"})
 
 
 def test_a_membrane_is_recognised() -> None:
-    said = fixed_height_warning(JOINT, _table(0.0).sample(frac=1, random_state=3))
-    assert 'set track.free = "mass" and particle.height_nm = 400' in said
-    across, along = (float(part.split()[0]) for part in said.split(" by ")[1:3])
-    assert across == pytest.approx(STEP_NM, rel=0.2)
-    assert along == pytest.approx(np.sqrt(2), rel=0.3)  # noise of two heights
+    found = fixed_height_warning(JOINT, _table(0.0).sample(frac=1, random_state=3))
+    assert found is not None
+    assert 'set track.free = "mass" and particle.height_nm = 400' in found.text
+    assert found.values["across_nm"] == pytest.approx(STEP_NM, rel=0.2)
+    assert found.values["along_nm"] == pytest.approx(np.sqrt(2), rel=0.3)  # noise of two heights
 
 
 @pytest.mark.parametrize("along", [1.0, 0.15])
 def test_particles_that_move_along_z_are_none(along: float) -> None:
     """Near the coverslip they move less along z than along it."""
-    assert fixed_height_warning(JOINT, _table(along)) == ""
+    assert fixed_height_warning(JOINT, _table(along)) is None
 
 
 def test_nothing_is_said_where_little_is_known() -> None:
-    assert fixed_height_warning(JOINT, _table(0.0, frames=12)) == ""
-    assert fixed_height_warning(JOINT, _table(0.0).assign(status="poor_fit")) == ""
-    assert fixed_height_warning(JOINT, _table(0.0).assign(frame=np.arange(120) * 2)) == ""
+    assert fixed_height_warning(JOINT, _table(0.0, frames=12)) is None
+    assert fixed_height_warning(JOINT, _table(0.0).assign(status="poor_fit")) is None
+    assert fixed_height_warning(JOINT, _table(0.0).assign(frame=np.arange(120) * 2)) is None
     held = make_config(fit={"mode": "track"}, track={"free": "mass"})
-    assert fixed_height_warning(held, _table(0.0)) == ""
+    assert fixed_height_warning(held, _table(0.0)) is None
 
 
 MOVIE = {

@@ -66,7 +66,8 @@ def test_the_correlation_of_neighbours_is_measured() -> None:
     assert found.neighbours[0] == pytest.approx(a * b / (a**2 + b**2), abs=error)
     assert abs(found.neighbours[1]) < error
     assert found.summed[0] == pytest.approx(1.0, abs=5 * found.summed[1])
-    assert "in x" in found.message
+    assert found.finding is not None
+    assert "in x" in found.finding.text
     assert found.shared == (0, 0)
 
 
@@ -78,14 +79,15 @@ def test_rows_that_flicker_are_measured() -> None:
     assert found.shared[0] == pytest.approx(added / (1 + added), rel=0.05)
     assert found.shared[1] == 0
     assert found.variance == pytest.approx(1 + added, rel=0.01)
-    assert "whole rows flicker" in found.message
-    assert "correlated" not in found.message
+    assert found.finding is not None
+    assert "whole rows flicker" in found.finding.text
+    assert "correlated" not in found.finding.text
 
 
 def test_noise_of_another_size_needs_no_line() -> None:
     found = _measured(read_noise_e=50.0)
     assert found.variance == pytest.approx(1 + 50.0**2 / _light().mean(), rel=0.02)
-    assert found.message == ""
+    assert found.finding is None
     np.testing.assert_allclose(found.power, found.variance, rtol=1e-12)
 
 

@@ -46,6 +46,5 @@ def test_averaged_and_recursively_filtered_frames(kept: float, expected: float |
     assert shared == pytest.approx(expected or 1 - kept, rel=0.05)
     noise = judge_counts(counts, CAMERA)
     assert noise.spectrum is None  # of neighbours too: its threshold would let noise pass
-    (message,) = noise.messages
-    assert "averaged, interpolated or filtered in time" in message
-    assert "set camera.gain" not in message
+    (found,) = noise.findings
+    assert found.code == "frames-filtered"

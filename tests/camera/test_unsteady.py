@@ -14,7 +14,7 @@ from scenes import make_config
 from small_movies import SETUP, simulate
 
 import iscat_analysis as ia
-from iscat_analysis.camera import Camera, find_unsteady, unsteady_message
+from iscat_analysis.camera import Camera, find_unsteady, unsteady_finding
 from iscat_analysis.diagnosis import least_beside
 from iscat_analysis.study import Movie
 
@@ -57,8 +57,8 @@ def test_a_noisy_column_is_named(excess: float) -> None:
     assert odd is not None
     assert odd[:, 40].all()
     assert odd.sum() == SHAPE[0]
-    message = unsteady_message(odd)
-    assert message.startswith("48 pixels (column 40) have noise that is not the light's")
+    text = unsteady_finding(odd, "m.tif").text
+    assert text.startswith("m.tif: 48 pixels (column 40) have noise that is not the light's")
 
 
 def test_a_border_that_is_always_the_same() -> None:

@@ -63,7 +63,7 @@ def _zero(counts: Counts, offset: float = 0.0) -> LightZero:
 
 def _said(counts: Counts, offset: float = 0.0, **more: Any) -> str:
     camera = Camera(gain_e_per_adu=GAIN, offset_adu=offset)
-    return " ".join(judge_counts(counts, camera, **more).messages)
+    return " ".join(found.text for found in judge_counts(counts, camera, **more).findings)
 
 
 @pytest.mark.parametrize("power", [0.01, 0.0])
@@ -149,11 +149,10 @@ def test_where_nothing_tells_them_apart_both_are_named() -> None:
 def test_what_may_be_either_is_one_line(factor: float) -> None:
     """The gain was said to be wrong in one line, and not to be told from the offset in the next."""
     movie = _movie(3, power=0.0, speckle=0.0, gain=GAIN / factor)
-    (said,) = judge_counts(movie, Camera(gain_e_per_adu=GAIN)).messages
-    (advised,) = map(float, re.findall(r"then set camera.gain_e_per_adu = ([\d.]+)", said))
-    assert advised == pytest.approx(GAIN / factor, rel=0.02)
-    assert "does not tell" in said
-    assert ("light that is noisy by itself" in said) == (factor > 1)
+    (found,) = judge_counts(movie, Camera(gain_e_per_adu=GAIN)).findings
+    assert found.code == "offset-or-gain"
+    assert found.values["measured"] == pytest.approx(GAIN / factor, rel=0.02)
+    assert ("light that is noisy by itself" in found.text) == (factor > 1)
 
 
 def test_few_frames_say_nothing() -> None:

@@ -15,6 +15,7 @@ from wanderers import wander
 from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis import Noise, judge_beside
+from iscat_analysis.findings.camera import GAIN_OFF
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
@@ -108,11 +109,14 @@ def test_particles_that_go_everywhere_leave_nothing_to_judge(wandering: Counts) 
             judge_beside(
                 context, movie, camera, (0, 60), (frame, places), used,
                 lambda count: camera.to_electrons(wandering[:count]),
-            ).messages
+            ).findings
             for places in (everywhere, everywhere + 1e5)
         ]  # fmt: skip
     assert not said[0]
     assert said[1]
+
+
+OFF = GAIN_OFF({"ratio": 1.55, "ratio_se": 0.01, "gain": GAIN, "unless": "", "measured": 12.9})
 
 
 @pytest.mark.parametrize("way", ["track", "known track"])
@@ -120,8 +124,7 @@ def test_noise_that_fits_do_not_have_is_not_blamed_on_the_gain(
     way: str, wandering: Counts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As rings seem to be, of which a wrong microscope leaves over something everywhere."""
-    said = "set camera.gain_e_per_adu = 12.9"
-    rings = Noise((said,), True, ExcessNoise(1.55, said))
+    rings = Noise((OFF,), True, ExcessNoise(1.55, OFF.text))
     learnt = way == "track"
     module = block_store if learnt else before_after
     monkeypatch.setattr(module, "judge_beside", lambda *_: rings)
@@ -130,13 +133,13 @@ def test_noise_that_fits_do_not_have_is_not_blamed_on_the_gain(
 
 
 def test_noise_that_all_fits_have_is_told() -> None:
-    noise = Noise(("set camera.gain_e_per_adu = 12.9",), True, ExcessNoise(1.55, ""))
+    noise = Noise((OFF,), True, ExcessNoise(1.55, ""))
     spread = np.linspace(-0.1, 0.1, 50)
     assert noise.compared_with_fits(1.55 + spread) is noise
     assert noise.compared_with_fits(3.0 + spread) is noise  # of a wrong microscope as well
-    assert not noise.compared_with_fits(np.append(3.0 + spread, [1.1] * 10)).messages
+    assert not noise.compared_with_fits(np.append(3.0 + spread, [1.1] * 10)).findings
     assert noise.compared_with_fits(np.full(5, 1.0)) is noise  # too few to tell
-    less = Noise(("set camera.gain_e_per_adu = 30",), True)
+    less = Noise((OFF,), True)
     assert less.compared_with_fits(1.0 + spread) is less
 
 

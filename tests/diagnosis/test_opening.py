@@ -46,10 +46,9 @@ def test_a_pattern_that_shakes_is_no_wrong_gain(rms_px: float) -> None:
     assert found is not None
     assert found.share > 0.9
     assert found.rms_px == pytest.approx(rms_px, rel=0.25)  # 78 numbers: 8 %
-    message = diagnose_gain(counts, camera).message
-    assert message is not None
-    assert "the fixed pattern shakes by" in message
-    assert "set camera.gain" not in message
+    finding = diagnose_gain(counts, camera).finding
+    assert finding is not None
+    assert finding.code == "pattern-shakes"
 
 
 def test_noise_of_single_pixels_is_no_shaking() -> None:
@@ -58,9 +57,10 @@ def test_noise_of_single_pixels_is_no_shaking() -> None:
     found = measure_pattern_jitter(counts, camera)
     assert found is not None
     assert abs(found.share) < 0.05
-    message = diagnose_gain(counts, camera).message
-    assert message is not None
-    assert message.endswith("set camera.gain_e_per_adu = 0.5") or "= 0.4" in message
+    finding = diagnose_gain(counts, camera).finding
+    assert finding is not None
+    assert finding.code == "gain-off"
+    assert 0.4 <= float(finding.values["measured"]) < 0.5005
 
 
 def test_without_noise_beyond_the_light_nothing_shakes() -> None:
@@ -75,21 +75,20 @@ def test_without_noise_beyond_the_light_nothing_shakes() -> None:
 def test_counts_that_are_too_coarse_are_no_wrong_gain(gain: float) -> None:
     """Of 8 bits: noise of 0.3 counts, which rounding hides, whatever gain was configured."""
     counts = (_movie(0.0) // 1024).astype(np.uint8)
-    message = diagnose_gain(counts, Camera(gain_e_per_adu=gain, well_depth_e=1e9)).message
+    finding = diagnose_gain(counts, Camera(gain_e_per_adu=gain, well_depth_e=1e9)).finding
     if gain == 1024.0:  # which predicts the noise, with what rounding adds
-        assert message is None
+        assert finding is None
         return
-    assert message is not None
-    assert "record or export the movie with more bits" in message
-    assert "set camera.gain" not in message
+    assert finding is not None
+    assert finding.code == "noise-rounded"
 
 
 @pytest.mark.parametrize(("order", "lines"), [((1, 2, 0), "columns"), ((1, 0, 2), "rows")])
 def test_axes_in_another_order_are_told(order: tuple[int, int, int], lines: str) -> None:
     counts = _movie(0.05)
-    said = axes_warning("m.npy", np.transpose(counts, order))
-    assert said.startswith(f"m.npy: frames differ more from each other than neighbouring {lines} ")
-    assert "the axes must be (t, y, x)" in said
+    found = axes_warning("m.npy", np.transpose(counts, order))
+    assert found is not None
+    assert (found.code, found.where, found.values["lines"]) == ("axes-swapped", "m.npy", lines)
 
 
 def test_axes_in_order_are_not_told() -> None:
@@ -104,7 +103,7 @@ def test_axes_in_order_are_not_told() -> None:
     lost = np.full((30, *SHAPE), np.nan)
     dark = np.zeros((30, *SHAPE))
     for counts in (_movie(0.05), _movie(0.5), even, flicker, border, dark, broken, lost):
-        assert axes_warning("m.npy", counts) == ""
+        assert axes_warning("m.npy", counts) is None
 
 
 @pytest.mark.parametrize("mode", ["mass", "track"])

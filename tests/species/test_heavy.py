@@ -57,7 +57,7 @@ def test_only_what_chance_does_not_hide_is_told() -> None:
     heavy = _table(5000.0, 10.0)
     assert re.match(
         r"1 particle, of up to 5000 kDa, is so heavy .* 4\.\d % too light",
-        nonlinearity_warning(scale, heavy),
+        nonlinearity_warning(scale, heavy).text,
     )
     shared = systematic(config, heavy, scale=scale)["mass_kda"]
     assert 0.04 < shared[1] / 5000 < 0.05
