@@ -28,13 +28,13 @@ from iscat_analysis.config import (
     Config,
     Optics,
     OpticsCovariance,
+    Source,
     StandardsCamera,
     load_config,
     parse_config,
+    read_toml,
     toml_value,
 )
-from iscat_analysis.config.files import read_toml
-from iscat_analysis.config.overrides import Source
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, forward_model
 from iscat_analysis.reading import is_file, is_folder

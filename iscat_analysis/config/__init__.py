@@ -1,38 +1,53 @@
 """The configuration: its keys, how files are read, and how single keys are changed.
 
 `instrument`, `analysis` and `synthetic` have the sections and their keys, `values` the allowed
-values, and `schema` the whole configuration; `named` has set-ups from publications.  Only
-`configure` makes a `Config`: files, mappings, keyword arguments and ``--set`` all go through it, so
-that the same keys give the same configuration and a later value always replaces an earlier one.
-`files` reads and writes TOML, and `renamed` accepts old names for one release.
+values, `kinds` what schemes, modes and methods mean, and `schema` the whole configuration; `named`
+has set-ups from publications.  Only `configure` in `files` makes a `Config`: files, mappings,
+keyword arguments and ``--set`` all go through it, so that the same keys give the same configuration
+and a later value always replaces an earlier one.
 """
 
 from __future__ import annotations
 
 from iscat_analysis.config.analysis import (
     BackgroundConfig,
+    Calibration,
     Compute,
     Detection,
     Fit,
     PosteriorConfig,
+    StandardsCamera,
     TrackConfig,
+    Uncertainty,
 )
-from iscat_analysis.config.covariance import ABERRATIONS, MEASURABLE, OpticsCovariance
-from iscat_analysis.config.field import FIELD_TERMS, JUMPS, MOVES, MOVING, field_keys
 from iscat_analysis.config.files import (
     OpticsFile,
+    Source,
     config_to_toml,
+    configure,
+    known_keys,
+    load_config,
+    parse_config,
     read_optics_file,
+    read_toml,
     toml_value,
     with_absolute_paths,
 )
 from iscat_analysis.config.instrument import (
+    ABERRATIONS,
     ASSUMED,
     AUTO,
+    FIELD_TERMS,
+    JUMPS,
     LARGEST_SD_NM,
+    MEASURABLE,
+    MOVES,
+    MOVING,
     CameraConfig,
     Optics,
+    OpticsCovariance,
     Particle,
+    field_keys,
 )
 from iscat_analysis.config.kinds import (
     METHODS,
@@ -45,9 +60,7 @@ from iscat_analysis.config.kinds import (
     Way,
 )
 from iscat_analysis.config.named import Instrument, Instruments, instruments
-from iscat_analysis.config.overrides import configure, load_config, parse_config
-from iscat_analysis.config.scale import Calibration, StandardsCamera, Uncertainty
-from iscat_analysis.config.schema import Config, refuse_rod, refuse_sphere
+from iscat_analysis.config.schema import INVISIBLE, Config, refuse_rod, refuse_sphere
 from iscat_analysis.config.synthetic import (
     SIMULATED,
     BoundsConfig,
@@ -57,7 +70,9 @@ from iscat_analysis.config.synthetic import (
 )
 from iscat_analysis.config.values import (
     ALL,
+    LARGEST_NM,
     PIXEL_NM,
+    WAVELENGTH_NM,
     Method,
     Mode,
     Scheme,
@@ -72,7 +87,9 @@ __all__ = [
     "ASSUMED",
     "AUTO",
     "FIELD_TERMS",
+    "INVISIBLE",
     "JUMPS",
+    "LARGEST_NM",
     "LARGEST_SD_NM",
     "MEASURABLE",
     "METHODS",
@@ -83,6 +100,7 @@ __all__ = [
     "PIXEL_NM",
     "SCHEMES",
     "SIMULATED",
+    "WAVELENGTH_NM",
     "BackgroundConfig",
     "BoundsConfig",
     "Calibration",
@@ -108,6 +126,7 @@ __all__ = [
     "SimulatedEvent",
     "SimulatedMover",
     "Simulation",
+    "Source",
     "SphereKind",
     "StandardsCamera",
     "TrackConfig",
@@ -117,10 +136,12 @@ __all__ = [
     "configure",
     "field_keys",
     "instruments",
+    "known_keys",
     "load_config",
     "parse_config",
     "plausible_pixel",
     "read_optics_file",
+    "read_toml",
     "refuse_rod",
     "refuse_sphere",
     "toml_value",

@@ -1,15 +1,14 @@
-"""Sections of the instrument and of the sample: optics, camera, particle, mass scale."""
+"""Sections of microscope and sample: optics, also over field and time, camera, particle."""
 
 from __future__ import annotations
 
 import cmath
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from iscat_analysis.config.covariance import ABERRATIONS, OpticsCovariance
-from iscat_analysis.config.field import MOST_JUMPS, FieldTerms, Jump, Share, Size
 from iscat_analysis.config.kinds import SCHEMES, SchemeKind
 from iscat_analysis.config.values import (
     LARGEST_NM,
@@ -25,6 +24,155 @@ from iscat_analysis.config.values import (
     refractive_index,
 )
 from iscat_analysis.units import sphere_diameter_nm, sphere_mass_kda
+
+Size = Annotated[Finite, Field(ge=-1000.0, le=1000.0)]
+Share = Annotated[Finite, Field(ge=-0.5, le=0.5)]
+
+FIELD_TERMS: Mapping[str, tuple[str, int | None]] = {
+    "focus_tilt_x_nm": ("focus_tilt_nm", 0),
+    "focus_tilt_y_nm": ("focus_tilt_nm", 1),
+    "focus_curvature_nm": ("focus_curvature_nm", None),
+    "coma_field_nm": ("coma_field_nm", None),
+    "astigmatism_field_x_nm": ("astigmatism_field_nm", 0),
+    "astigmatism_field_y_nm": ("astigmatism_field_nm", 1),
+    "phase_tilt_x_deg": ("phase_tilt_deg", 0),
+    "phase_tilt_y_deg": ("phase_tilt_deg", 1),
+    "phase_curvature_deg": ("phase_curvature_deg", None),
+    "reference_tilt_x": ("reference_tilt", 0),
+    "reference_tilt_y": ("reference_tilt", 1),
+    "reference_curvature": ("reference_curvature", None),
+}
+"""Every coefficient by a name of its own: its key in ``[optics]``, and its place in a pair."""
+
+
+MOVING: Mapping[str, Any] = {
+    "focus_drift_nm": 0.0,
+    "focus_bend_nm": 0.0,
+    "focus_jumps": (),
+    "focus_frame": 0,
+}
+"""Keys of ``[optics]`` that move the focus during a movie, and their values where it rests."""
+
+Jump = tuple[Annotated[int, Field(ge=0)], Size]
+"""Frame, and rise of the focus there [nm]."""
+
+MOST_JUMPS = 4
+"""Jumps of the focus that a movie may have."""
+
+JUMPS = tuple(f"focus_jump_{number}_nm" for number in range(1, MOST_JUMPS + 1))
+"""Rises of the focus at the frames of ``focus_jumps`` [nm]."""
+
+MOVES = ("focus_drift_nm", "focus_bend_nm", *JUMPS)
+"""What moves the focus during a movie, each coefficient by a name of its own."""
+
+
+class FieldTerms(Section):
+    """Terms of the field by name; each is the change from its centre to its edge."""
+
+    def field_term(self, name: str) -> float:
+        """Give a coefficient by its own name.
+
+        Parameters
+        ----------
+        name : str
+            One of `FIELD_TERMS`.
+
+        Returns
+        -------
+        float
+            Its value, in the unit that the name ends with.
+        """
+        key, index = FIELD_TERMS[name]
+        value = getattr(self, key)
+        return float(value if index is None else value[index])
+
+    @property
+    def is_even(self) -> bool:
+        """Whether the microscope is the same everywhere in its field."""
+        return not any(self.field_term(name) for name in FIELD_TERMS)
+
+
+def field_keys(terms: Mapping[str, float]) -> dict[str, float | tuple[float, float]]:
+    """Give coefficients as keys of ``[optics]``; what of a pair is not named is 0.
+
+    Parameters
+    ----------
+    terms : Mapping[str, float]
+        Coefficients by name, others are left out.
+
+    Returns
+    -------
+    dict
+        By key.
+    """
+    out: dict[str, float | tuple[float, float]] = {}
+    for name, (key, index) in FIELD_TERMS.items():
+        if name not in terms:
+            continue
+        if index is None:
+            out[key] = terms[name]
+        else:
+            pair = [terms.get(n, 0.0) for n, (k, _) in FIELD_TERMS.items() if k == key]
+            out[key] = (pair[0], pair[1])
+    return out
+
+
+ABERRATIONS = tuple(f"z{j}" for j in range(5, 38))
+"""Zernike terms that can be set, by Noll's index."""
+
+MEASURABLE = (
+    "focus_nm",
+    "na",
+    "reference_phase_deg",
+    "mask_na",
+    "attenuation",
+    "polarization_deg",
+    *ABERRATIONS,
+)
+"""Parameters of the optics that can be learned from images, and that have a derivative."""
+
+
+class OpticsCovariance(Section):
+    """Errors of measured optics, section ``[covariance]`` of ``optics.toml``."""
+
+    names: tuple[str, ...]
+    """keys of [optics], each aberration by its own name"""
+    matrix: tuple[tuple[Finite, ...], ...]
+    """covariance, in the order of names"""
+
+    @property
+    def of_the_middle(self) -> OpticsCovariance:
+        """Errors of the optics in the middle of the field, without those of its terms."""
+        return self._without({*FIELD_TERMS, *MOVES})
+
+    @property
+    def at_rest(self) -> OpticsCovariance:
+        """Errors of the microscope, without those of how its focus moved in a movie."""
+        return self._without({*MOVES})
+
+    def _without(self, left_out: set[str]) -> OpticsCovariance:
+        kept = [k for k, name in enumerate(self.names) if name not in left_out]
+        matrix = tuple(tuple(self.matrix[i][k] for k in kept) for i in kept)
+        return OpticsCovariance(names=tuple(self.names[k] for k in kept), matrix=matrix)
+
+    @model_validator(mode="after")
+    def _symmetric(self) -> OpticsCovariance:
+        size = len(self.names)
+        known = (*MEASURABLE, *FIELD_TERMS, *MOVES)
+        unknown = [name for name in self.names if name not in known]
+        if unknown:
+            raise ValueError(f"names has {unknown[0]}, which is none of {', '.join(known)}")
+        if len(self.matrix) != size or any(len(row) != size for row in self.matrix):
+            raise ValueError(f"matrix needs {size} rows of {size} numbers, one for each of names")
+        for i, row in enumerate(self.matrix):
+            for j in range(i):
+                room = 1e-6 * math.sqrt(abs(row[i] * self.matrix[j][j]))
+                if abs(row[j] - self.matrix[j][i]) > room:
+                    raise ValueError(f"matrix is not symmetric in {self.names[i]}, {self.names[j]}")
+            if row[i] < 0:
+                raise ValueError(f"matrix gives {self.names[i]} a negative variance")
+        return self
+
 
 Index = Annotated[Positive, AfterValidator(refractive_index)]
 
@@ -71,114 +219,86 @@ def _noll_names(terms: dict[str, float]) -> dict[str, float]:
 class Optics(FieldTerms):
     """The microscope (physics.md, section 1)."""
 
-    file: str | None = Field(
-        None, description="of `iscat calibrate optics`; its values replace those of this section"
-    )
-    wavelength_nm: Annotated[Positive, length(*WAVELENGTH_NM)] = Field(
-        525.0, description="vacuum wavelength"
-    )
-    na: Positive = Field(1.42, description="numerical aperture")
-    n_immersion: Index = Field(1.515, description="refractive index of the immersion oil")
-    n_glass: Index = Field(1.515, description="refractive index of the coverslip")
-    n_sample: Index = Field(1.33, description="refractive index of the sample")
-    scheme: Scheme = Field("iscat", description='"iscat" | "cobri" | "darkfield"')
-    attenuation: NonNegative = Field(
-        1.0, description="amplitude of the reference that passes; ignored in dark field"
-    )
-    polarization: Literal["linear", "circular"] = Field(
-        "linear", description='of the illumination: "linear" | "circular"'
-    )
-    polarization_deg: Finite = Field(
-        0.0, description="of linear light, from the image's x axis towards y"
-    )
-    analyzer: bool = Field(
-        False, description="only light polarised as the reference reaches the camera"
-    )
-    mask_na: NonNegative = Field(
-        0.0, description="a disc in the pupil attenuates below this NA; 0: the reference alone"
-    )
-    reference_phase_deg: Finite = Field(
-        0.0, description="delay of the reference against the scattered light"
-    )
+    file: str | None = None
+    """of `iscat calibrate optics`; its values replace those of this section"""
+    wavelength_nm: Annotated[Positive, length(*WAVELENGTH_NM)] = 525.0
+    """vacuum wavelength"""
+    na: Positive = 1.42
+    """numerical aperture"""
+    n_immersion: Index = 1.515
+    """refractive index of the immersion oil"""
+    n_glass: Index = 1.515
+    """refractive index of the coverslip"""
+    n_sample: Index = 1.33
+    """refractive index of the sample"""
+    scheme: Scheme = "iscat"
+    """ "iscat" | "cobri" | "darkfield" """
+    attenuation: NonNegative = 1.0
+    """amplitude of the reference that passes; ignored in dark field"""
+    polarization: Literal["linear", "circular"] = "linear"
+    """of the illumination: "linear" | "circular" """
+    polarization_deg: Finite = 0.0
+    """of linear light, from the image's x axis towards y"""
+    analyzer: bool = False
+    """only light polarised as the reference reaches the camera"""
+    mask_na: NonNegative = 0.0
+    """a disc in the pupil attenuates below this NA; 0: the reference alone"""
+    reference_phase_deg: Finite = 0.0
+    """delay of the reference against the scattered light"""
     aberrations_nm: Annotated[dict[str, Finite], AfterValidator(_noll_names)] = Field(
-        default_factory=dict,
-        description="Zernike terms, Noll z5 to z37, rms path over the pupil: { z11 = 8.0 }",
+        default_factory=dict
     )
-    focus_nm: Annotated[Finite, length(0.0, LARGEST_NM)] = Field(
-        -300.0,
-        description="focus height z_f; sets the oil thickness for a particle at particle.height_nm",
-    )
-    focus_drift_nm: Annotated[Finite, length(0.0, LARGEST_NM)] = Field(
-        0.0, description="rise of the focus in 1000 frames of a landing movie"
-    )
-    focus_bend_nm: Finite = Field(
-        0.0, description="the same, growing with the square of the frames from focus_frame"
-    )
-    focus_jumps: Annotated[tuple[Jump, ...], Field(max_length=MOST_JUMPS)] = Field(
-        (), description="[[frame, rise], ...]: the focus rises at once, and stays"
-    )
-    focus_frame: Annotated[int, Field(ge=0)] = Field(
-        0, description="frame at which the focus is focus_nm, but for jumps"
-    )
-    convention: Literal["exact", "dong2021"] = Field(
-        "exact", description='"exact" | "dong2021" (the paper\'s numbers, errors included)'
-    )
-    axial: Literal["stage", "refocus"] = Field(
-        "stage", description='fixed in derivatives along z: "stage" | "refocus": the focus follows'
-    )
-    emission: Literal["reciprocal", "dong2021"] = Field(
-        "reciprocal", description='"reciprocal" (conserves energy) | "dong2021" (as in the paper)'
-    )
-    psf: Literal["model", "measured"] = Field(
-        "model", description='"model" | "measured" (the image in template; mode mass only)'
-    )
-    template: str | None = Field(
-        None, description="file of `iscat calibrate optics --measured`, named in its optics.toml"
-    )
-    calibrate: Literal["auto", "always", "never"] = Field(
-        "auto", description='"auto" | "always" | "never": learn the optics from the movie'
-    )
+    """Zernike terms, Noll z5 to z37, rms path over the pupil: { z11 = 8.0 }"""
+    focus_nm: Annotated[Finite, length(0.0, LARGEST_NM)] = -300.0
+    """focus height z_f; sets the oil thickness for a particle at particle.height_nm"""
+    focus_drift_nm: Annotated[Finite, length(0.0, LARGEST_NM)] = 0.0
+    """rise of the focus in 1000 frames of a landing movie"""
+    focus_bend_nm: Finite = 0.0
+    """the same, growing with the square of the frames from focus_frame"""
+    focus_jumps: Annotated[tuple[Jump, ...], Field(max_length=MOST_JUMPS)] = ()
+    """[[frame, rise], ...]: the focus rises at once, and stays"""
+    focus_frame: Annotated[int, Field(ge=0)] = 0
+    """frame at which the focus is focus_nm, but for jumps"""
+    convention: Literal["exact", "dong2021"] = "exact"
+    """ "exact" | "dong2021" (the paper's numbers, errors included)"""
+    axial: Literal["stage", "refocus"] = "stage"
+    """fixed in derivatives along z: "stage" | "refocus": the focus follows"""
+    emission: Literal["reciprocal", "dong2021"] = "reciprocal"
+    """ "reciprocal" (conserves energy) | "dong2021" (as in the paper)"""
+    psf: Literal["model", "measured"] = "model"
+    """ "model" | "measured" (the image in template; mode mass only)"""
+    template: str | None = None
+    """file of `iscat calibrate optics --measured`, named in its optics.toml"""
+    calibrate: Literal["auto", "always", "never"] = "auto"
+    """ "auto" | "always" | "never": learn the optics from the movie"""
 
-    illumination_na: Annotated[Finite, Field(ge=0, le=0.5)] = Field(
-        0.0, description="aperture of a cone that is evenly filled with light; 0: one plane wave"
-    )
-    bandwidth_nm: Annotated[Finite, Field(ge=0, le=100.0)] = Field(
-        0.0, description="full width at half maximum of the spectrum; 0: one wavelength"
-    )
+    illumination_na: Annotated[Finite, Field(ge=0, le=0.5)] = 0.0
+    """aperture of a cone that is evenly filled with light; 0: one plane wave"""
+    bandwidth_nm: Annotated[Finite, Field(ge=0, le=100.0)] = 0.0
+    """full width at half maximum of the spectrum; 0: one wavelength"""
 
-    focus_tilt_nm: tuple[Size, Size] = Field(
-        (0.0, 0.0), description="rise of the focus from the centre of the field to its edge, [x, y]"
-    )
-    focus_curvature_nm: Size = Field(
-        0.0, description="the same, growing with the square of the distance from the centre"
-    )
-    coma_field_nm: Size = Field(
-        0.0, description="coma at the edge of the field, along the radius and growing with it"
-    )
-    astigmatism_field_nm: tuple[Size, Size] = Field(
-        (0.0, 0.0), description="astigmatism at the edge, linear in the field, [x, y]"
-    )
-    phase_tilt_deg: tuple[Size, Size] = Field(
-        (0.0, 0.0), description="change of reference_phase_deg from centre to edge, [x, y]"
-    )
-    phase_curvature_deg: Size = Field(
-        0.0, description="the same, growing with the square of the distance"
-    )
-    reference_tilt: tuple[Share, Share] = Field(
-        (0.0, 0.0), description="change of the reference's amplitude from centre to edge, a share"
-    )
-    reference_curvature: Share = Field(
-        0.0, description="the same, growing with the square of the distance"
-    )
-    field_px: tuple[Finite, Finite, Annotated[Finite, Field(gt=0)]] | None = Field(
-        None,
-        description="centre x, y of the field and half its longer side [pixels], for which these "
-        "terms hold; the movie's where absent",
-    )
+    focus_tilt_nm: tuple[Size, Size] = (0.0, 0.0)
+    """rise of the focus from the centre of the field to its edge, [x, y]"""
+    focus_curvature_nm: Size = 0.0
+    """the same, growing with the square of the distance from the centre"""
+    coma_field_nm: Size = 0.0
+    """coma at the edge of the field, along the radius and growing with it"""
+    astigmatism_field_nm: tuple[Size, Size] = (0.0, 0.0)
+    """astigmatism at the edge, linear in the field, [x, y]"""
+    phase_tilt_deg: tuple[Size, Size] = (0.0, 0.0)
+    """change of reference_phase_deg from centre to edge, [x, y]"""
+    phase_curvature_deg: Size = 0.0
+    """the same, growing with the square of the distance"""
+    reference_tilt: tuple[Share, Share] = (0.0, 0.0)
+    """change of the reference's amplitude from centre to edge, a share"""
+    reference_curvature: Share = 0.0
+    """the same, growing with the square of the distance"""
+    field_px: tuple[Finite, Finite, Annotated[Finite, Field(gt=0)]] | None = None
+    """centre x, y of the field and half its longer side [pixels], for which these terms hold; the
+    movie's where absent"""
 
-    covariance: OpticsCovariance | None = Field(
-        None, description="of the measured keys, { names, matrix }; taken from the file"
-    )
+    covariance: OpticsCovariance | None = None
+    """of the measured keys, { names, matrix }; taken from the file"""
 
     @property
     def kind(self) -> SchemeKind:
@@ -268,43 +388,32 @@ ASSUMED: Mapping[str, float] = {"gain_e_per_adu": 1.0, "offset_adu": 0.0, "read_
 class CameraConfig(Section):
     """The detector, in the sample plane."""
 
-    pixel_size_nm: Annotated[Positive, AfterValidator(plausible_pixel)] | None = Field(
-        None, description="in the sample plane; absent: taken from the metadata"
-    )
-    gain_e_per_adu: Positive | str = Field(
-        AUTO,
-        description='photoelectrons per count: a number, the path of a TIFF map, or "auto": '
-        "measured from the movie's noise",
-    )
-    offset_adu: Finite | str = Field(
-        AUTO,
-        description='counts in the dark: a number, a map, or "auto": from dark frames, or from '
-        "flicker and noise of the pixels",
-    )
-    read_noise_e: NonNegative | str = Field(
-        AUTO, description='read noise, standard deviation per frame: a number, a map, or "auto"'
-    )
-    response: str | None = Field(
-        None, description="CSV file of counts and photoelectrons, for a camera that is not linear"
-    )
-    well_depth_e: Positive | None = Field(
-        None, description="full well: counts at or above it are flagged as saturated"
-    )
-    channels: ChannelOf | None = Field(
-        None,
-        description="[2, 0]: frames of two channels take turns, and those of the first are a movie "
-        "of their own, with numbers and times of their own",
-    )
-    exposure_ms: Positive | None = Field(None, description="absent: taken from the metadata")
-    frame_rate_hz: Positive | None = Field(None, description="absent: taken from the metadata")
-    samples_per_pixel: Literal["auto"] | Annotated[int, Field(ge=1, le=9)] = Field(
-        "auto",
-        description='along each axis, to integrate over pixels: 1 to 9 | "auto": as many as are '
-        "needed, or those of the calibration's standards; 1: the light at the centre",
-    )
-    fill_factor: Annotated[float, Field(gt=0, le=1)] = Field(
-        1.0, description="share of a pixel's area that detects light, a square at its centre"
-    )
+    pixel_size_nm: Annotated[Positive, AfterValidator(plausible_pixel)] | None = None
+    """in the sample plane; absent: taken from the metadata"""
+    gain_e_per_adu: Positive | str = AUTO
+    """photoelectrons per count: a number, the path of a TIFF map, or "auto": measured from the
+    movie's noise"""
+    offset_adu: Finite | str = AUTO
+    """counts in the dark: a number, a map, or "auto": from dark frames, or from flicker and
+    noise of the pixels"""
+    read_noise_e: NonNegative | str = AUTO
+    """read noise, standard deviation per frame: a number, a map, or "auto" """
+    response: str | None = None
+    """CSV file of counts and photoelectrons, for a camera that is not linear"""
+    well_depth_e: Positive | None = None
+    """full well: counts at or above it are flagged as saturated"""
+    channels: ChannelOf | None = None
+    """[2, 0]: frames of two channels take turns, and those of the first are a movie of their own,
+    with numbers and times of their own"""
+    exposure_ms: Positive | None = None
+    """absent: taken from the metadata"""
+    frame_rate_hz: Positive | None = None
+    """absent: taken from the metadata"""
+    samples_per_pixel: Literal["auto"] | Annotated[int, Field(ge=1, le=9)] = "auto"
+    """along each axis, to integrate over pixels: 1 to 9 | "auto": as many as are needed, or
+    those of the calibration's standards; 1: the light at the centre"""
+    fill_factor: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """share of a pixel's area that detects light, a square at its centre"""
 
     @property
     def assumed(self) -> CameraConfig:
@@ -316,68 +425,49 @@ class CameraConfig(Section):
 class Particle(Section):
     """The particle that scatters."""
 
-    kind: Literal["gold", "silica", "polystyrene", "protein", "custom"] = Field(
-        "protein", description='"gold" | "silica" | "polystyrene" | "protein" | "custom"'
+    kind: Literal["gold", "silica", "polystyrene", "protein", "custom"] = "protein"
+    """ "gold" | "silica" | "polystyrene" | "protein" | "custom" """
+    model: Literal["dipole", "mie", "shell", "rod"] = "dipole"
+    """ "dipole" | "mie": a sphere of any size | "shell": a sphere in a shell | "rod": a spheroid
+    that is small"""
+    permittivity: tuple[float, float] | None = None
+    """relative, [re, im]; replaces that of the kind"""
+    index: Positive | None = None
+    """refractive index, in place of permittivity"""
+    shell_nm: Annotated[Positive, length(0.1, 1e3)] | None = None
+    """thickness of the shell, a part of the diameter; for model shell"""
+    shell_index: Index | None = None
+    """refractive index of the shell"""
+    aspect_ratio: Annotated[float, Field(ge=1, le=20)] | None = None
+    """length of a rod over its width; for model rod"""
+    azimuth_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
+    """direction of a rod in the image, from x towards y; for model rod"""
+    tilt_deg: Annotated[float, Field(ge=0, le=180)] | None = None
+    """angle between a rod and the optical axis; for model rod"""
+    density_kg_m3: Positive | None = None
+    """replaces that of the kind; for model shell, of core and shell together"""
+    mass_kda: Positive | None = None
+    """start value, and the true mass in a simulation"""
+    diameter_nm: Annotated[Positive, length(0.1, 1e4)] | None = None
+    """in place of mass_kda"""
+    height_nm: Literal["contact", "auto"] | Annotated[NonNegative, length(0.0, LARGEST_NM)] = (
+        USUAL_HEIGHT_NM
     )
-    model: Literal["dipole", "mie", "shell", "rod"] = Field(
-        "dipole",
-        description='"dipole" | "mie": a sphere of any size | "shell": a sphere in a shell | '
-        '"rod": a spheroid that is small',
-    )
-    permittivity: tuple[float, float] | None = Field(
-        None, description="relative, [re, im]; replaces that of the kind"
-    )
-    index: Positive | None = Field(None, description="refractive index, in place of permittivity")
-    shell_nm: Annotated[Positive, length(0.1, 1e3)] | None = Field(
-        None, description="thickness of the shell, a part of the diameter; for model shell"
-    )
-    shell_index: Index | None = Field(None, description="refractive index of the shell")
-    aspect_ratio: Annotated[float, Field(ge=1, le=20)] | None = Field(
-        None, description="length of a rod over its width; for model rod"
-    )
-    azimuth_deg: Annotated[float, Field(ge=-360, le=360)] | None = Field(
-        None, description="direction of a rod in the image, from x towards y; for model rod"
-    )
-    tilt_deg: Annotated[float, Field(ge=0, le=180)] | None = Field(
-        None, description="angle between a rod and the optical axis; for model rod"
-    )
-    density_kg_m3: Positive | None = Field(
-        None, description="replaces that of the kind; for model shell, of core and shell together"
-    )
-    mass_kda: Positive | None = Field(
-        None, description="start value, and the true mass in a simulation"
-    )
-    diameter_nm: Annotated[Positive, length(0.1, 1e4)] | None = Field(
-        None, description="in place of mass_kda"
-    )
-    height_nm: Literal["contact", "auto"] | Annotated[NonNegative, length(0.0, LARGEST_NM)] = Field(
-        USUAL_HEIGHT_NM,
-        description='z if it is fixed, else its start value | "contact": radius of the particle + '
-        'linker_nm; a sphere that has the default does that too | "auto": 5 nm for optics and mass '
-        "scale; for the particles, mean and spread are learned from the movie",
-    )
-    linker_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] = Field(
-        0.0, description='between coverslip and particle, for height_nm = "contact"'
-    )
-    height_sd_nm: Annotated[NonNegative, length(0.0, LARGEST_SD_NM)] = Field(
-        0.0,
-        description="standard deviation of heights; > 0: mode mass fits z with this normal prior",
-    )
-    wiggle_nm: Annotated[NonNegative, length(0.0, LARGEST_SD_NM)] = Field(
-        0.0,
-        description="standard deviation of a particle's position along each axis, if it wiggles "
-        "as on a tether",
-    )
-    learned_height_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = Field(
-        None,
-        description='mean height that height_nm = "auto" learned from a movie; optics and mass '
-        "scale stay those of height_nm",
-    )
-    photons_per_frame: Positive | None = Field(
-        None,
-        description="dark field: scattered photons collected per frame from a particle of this "
-        "mass; it sets the mass scale",
-    )
+    """z if it is fixed, else its start value | "contact": radius of the particle + linker_nm; a
+    sphere that has the default does that too | "auto": 5 nm for optics and mass scale; for the
+    particles, mean and spread are learned from the movie"""
+    linker_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] = 0.0
+    """between coverslip and particle, for height_nm = "contact" """
+    height_sd_nm: Annotated[NonNegative, length(0.0, LARGEST_SD_NM)] = 0.0
+    """standard deviation of heights; > 0: mode mass fits z with this normal prior"""
+    wiggle_nm: Annotated[NonNegative, length(0.0, LARGEST_SD_NM)] = 0.0
+    """standard deviation of a particle's position along each axis, if it wiggles as on a tether"""
+    learned_height_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = None
+    """mean height that height_nm = "auto" learned from a movie; optics and mass scale stay those of
+    height_nm"""
+    photons_per_frame: Positive | None = None
+    """dark field: scattered photons collected per frame from a particle of this mass; it sets the
+    mass scale"""
 
     @model_validator(mode="after")
     def _one_of(self) -> Particle:

@@ -11,14 +11,15 @@ from pydantic import Field, model_validator
 
 from iscat_analysis.config.analysis import (
     BackgroundConfig,
+    Calibration,
     Compute,
     Detection,
     Fit,
     PosteriorConfig,
     TrackConfig,
+    Uncertainty,
 )
 from iscat_analysis.config.instrument import AUTO, CameraConfig, Optics, Particle
-from iscat_analysis.config.scale import Calibration, Uncertainty
 from iscat_analysis.config.synthetic import BoundsConfig, Simulation
 from iscat_analysis.config.values import ALL, LARGEST_NM, Section, unit_guess
 from iscat_analysis.errors import ConfigError

@@ -17,16 +17,18 @@ _MOST_POSITIONS = 100_000_000
 class SimulatedEvent(Section):
     """One particle that lands, and may leave."""
 
-    frame: Annotated[int, Field(ge=0)] = Field(description="first frame with the particle")
-    leave: Annotated[int, Field(ge=1)] | None = Field(
-        None, description="first frame without it again"
-    )
-    x_px: Finite = Field(
-        description="column; integer = pixel centre; with drift, that of its first frame"
-    )
-    y_px: Finite = Field(description="row, downwards")
-    z_nm: NonNegative | None = Field(None, description="default particle.height_nm")
-    mass_kda: Positive | None = Field(None, description="default particle.mass_kda")
+    frame: Annotated[int, Field(ge=0)]
+    """first frame with the particle"""
+    leave: Annotated[int, Field(ge=1)] | None = None
+    """first frame without it again"""
+    x_px: Finite
+    """column; integer = pixel centre; with drift, that of its first frame"""
+    y_px: Finite
+    """row, downwards"""
+    z_nm: NonNegative | None = None
+    """default particle.height_nm"""
+    mass_kda: Positive | None = None
+    """default particle.mass_kda"""
 
     @model_validator(mode="after")
     def _leaves_later(self) -> SimulatedEvent:
@@ -38,37 +40,32 @@ class SimulatedEvent(Section):
 class SimulatedMover(Section):
     """Particles of one kind that diffuse."""
 
-    count: Annotated[int, Field(ge=1, le=100_000)] = Field(
-        1, description="in the field in the first frame; as many enter as leave later"
-    )
-    d_um2_s: NonNegative = Field(description="diffusion coefficient along each axis, µm²/s")
-    mass_kda: Positive | None = Field(None, description="default particle.mass_kda")
-    diameter_nm: Annotated[Positive, length(0.1, 1e4)] | None = Field(
-        None, description="in place of mass_kda, of the material of [particle]"
-    )
-    space: Literal["membrane", "volume"] = Field(
-        "membrane", description='"membrane": z is fixed | "volume": above a wall at z = 0'
-    )
-    z_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = Field(
-        None, description="at first; default particle.height_nm, with a ceiling random below it"
-    )
-    ceiling_nm: Annotated[Positive, length(0.0, LARGEST_NM)] | None = Field(
-        None, description="volume: height of a second wall that reflects"
-    )
-    drift_um_s: tuple[Finite, Finite] = Field(
-        (0.0, 0.0), description="velocity along x and y, µm/s"
-    )
-    confinement_nm: Annotated[Positive, length(1.0, LARGEST_NM)] | None = Field(
-        None, description="side of a square whose walls reflect, one for each particle"
-    )
-    frame: Annotated[int, Field(ge=0)] = Field(0, description="first frame with the particles")
-    leave: Annotated[int, Field(ge=1)] | None = Field(
-        None, description="first frame without them again"
-    )
-    x_px: Finite | None = Field(
-        None, description="column at first, of a single particle; absent: random"
-    )
-    y_px: Finite | None = Field(None, description="row at first, downwards")
+    count: Annotated[int, Field(ge=1, le=100_000)] = 1
+    """in the field in the first frame; as many enter as leave later"""
+    d_um2_s: NonNegative
+    """diffusion coefficient along each axis, µm²/s"""
+    mass_kda: Positive | None = None
+    """default particle.mass_kda"""
+    diameter_nm: Annotated[Positive, length(0.1, 1e4)] | None = None
+    """in place of mass_kda, of the material of [particle]"""
+    space: Literal["membrane", "volume"] = "membrane"
+    """ "membrane": z is fixed | "volume": above a wall at z = 0"""
+    z_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = None
+    """at first; default particle.height_nm, with a ceiling random below it"""
+    ceiling_nm: Annotated[Positive, length(0.0, LARGEST_NM)] | None = None
+    """volume: height of a second wall that reflects"""
+    drift_um_s: tuple[Finite, Finite] = (0.0, 0.0)
+    """velocity along x and y, µm/s"""
+    confinement_nm: Annotated[Positive, length(1.0, LARGEST_NM)] | None = None
+    """side of a square whose walls reflect, one for each particle"""
+    frame: Annotated[int, Field(ge=0)] = 0
+    """first frame with the particles"""
+    leave: Annotated[int, Field(ge=1)] | None = None
+    """first frame without them again"""
+    x_px: Finite | None = None
+    """column at first, of a single particle; absent: random"""
+    y_px: Finite | None = None
+    """row at first, downwards"""
 
     @model_validator(mode="after")
     def _possible(self) -> SimulatedMover:
@@ -101,34 +98,35 @@ class Simulation(Section):
     """A synthetic movie with known truth."""
 
     shape: tuple[Annotated[int, Field(ge=8, le=16_384)], Annotated[int, Field(ge=8, le=16_384)]] = (
-        Field((128, 128), description="rows, columns")
+        128,
+        128,
     )
-    frames: Annotated[int, Field(ge=2, le=MOST_FRAMES)] = Field(
-        400, description="frames in the movie"
-    )
-    photons_per_pixel: Positive = Field(
-        1e4,
-        description="background photoelectrons per pixel and frame; dark field: scattered photons "
-        "collected per frame from a particle of particle.mass_kda",
-    )
-    background: str = Field("flat", description='"flat" | "speckle" | path of a TIFF')
-    speckle_contrast: NonNegative = Field(0.1, description="standard deviation over mean")
-    power_noise: NonNegative = Field(0.0, description="relative laser-power noise, frame to frame")
-    drift_px_per_frame: tuple[Finite, Finite] = Field(
-        (0.0, 0.0), description="of background and particles together, along x and y"
-    )
-    seed: Annotated[int, Field(ge=0)] = Field(1, description="same seed, same bytes")
-    events: tuple[SimulatedEvent, ...] = Field((), description="each particle, placed by hand")
-    movers: tuple[SimulatedMover, ...] = Field((), description="particles that diffuse, by kind")
-    count: Annotated[int, Field(ge=0, le=1_000_000)] | None = Field(
-        None, description="landings at random positions and times, instead of events; 0: a blank"
-    )
-    leavings: Annotated[int, Field(ge=0)] = Field(
-        0, description="how many of the count leave before the movie ends"
-    )
-    species: tuple[Positive, ...] | None = Field(
-        None, description="masses [kDa] of the random particles, in equal shares"
-    )
+    """rows, columns"""
+    frames: Annotated[int, Field(ge=2, le=MOST_FRAMES)] = 400
+    """frames in the movie"""
+    photons_per_pixel: Positive = 1e4
+    """background photoelectrons per pixel and frame; dark field: scattered photons collected per
+    frame from a particle of particle.mass_kda"""
+    background: str = "flat"
+    """ "flat" | "speckle" | path of a TIFF"""
+    speckle_contrast: NonNegative = 0.1
+    """standard deviation over mean"""
+    power_noise: NonNegative = 0.0
+    """relative laser-power noise, frame to frame"""
+    drift_px_per_frame: tuple[Finite, Finite] = (0.0, 0.0)
+    """of background and particles together, along x and y"""
+    seed: Annotated[int, Field(ge=0)] = 1
+    """same seed, same bytes"""
+    events: tuple[SimulatedEvent, ...] = ()
+    """each particle, placed by hand"""
+    movers: tuple[SimulatedMover, ...] = ()
+    """particles that diffuse, by kind"""
+    count: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
+    """landings at random positions and times, instead of events; 0: a blank"""
+    leavings: Annotated[int, Field(ge=0)] = 0
+    """how many of the count leave before the movie ends"""
+    species: tuple[Positive, ...] | None = None
+    """masses [kDa] of the random particles, in equal shares"""
 
     @model_validator(mode="after")
     def _either(self) -> Simulation:
@@ -175,18 +173,21 @@ class Simulation(Section):
 class BoundsConfig(Section):
     """`iscat bounds`: one particle on a square field of pixel centres (i − (n−1)/2)·pixel size."""
 
-    pixels: Annotated[int, Field(ge=2, le=4096)] = Field(151, description="side of the field")
-    x_nm: Finite = Field(0.0, description="particle, from the centre of the field")
-    y_nm: Finite = Field(0.0, description="particle, from the centre of the field")
-    z_nm: NonNegative | None = Field(None, description="default particle.height_nm")
-    photons_per_pixel: Positive = Field(
-        1e4, description="background per frame; dark field: as in [simulation]"
-    )
-    n_before: Annotated[int, Field(ge=0)] = Field(200, description="0: known background")
-    n_after: Annotated[int, Field(ge=1)] = Field(200, description="frames with the particle")
-    false_alarm_probability: Annotated[float, Field(gt=0, lt=0.5)] = Field(
-        1e-3, description="for the smallest detected mass: that noise is taken for a particle"
-    )
-    miss_probability: Annotated[float, Field(gt=0, lt=0.5)] = Field(
-        0.05, description="for the smallest detected mass: that the particle is not found"
-    )
+    pixels: Annotated[int, Field(ge=2, le=4096)] = 151
+    """side of the field"""
+    x_nm: Finite = 0.0
+    """particle, from the centre of the field"""
+    y_nm: Finite = 0.0
+    """particle, from the centre of the field"""
+    z_nm: NonNegative | None = None
+    """default particle.height_nm"""
+    photons_per_pixel: Positive = 1e4
+    """background per frame; dark field: as in [simulation]"""
+    n_before: Annotated[int, Field(ge=0)] = 200
+    """0: known background"""
+    n_after: Annotated[int, Field(ge=1)] = 200
+    """frames with the particle"""
+    false_alarm_probability: Annotated[float, Field(gt=0, lt=0.5)] = 1e-3
+    """for the smallest detected mass: that noise is taken for a particle"""
+    miss_probability: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
+    """for the smallest detected mass: that the particle is not found"""

@@ -150,7 +150,7 @@ class _Called(ModelMetaclass):
         try:
             return super().__call__(*args, **kwargs)
         except ValidationError as error:
-            from iscat_analysis.config.complaints import complaints, section_name
+            from iscat_analysis.config.files import complaints, section_name
 
             name = section_name(self)
             items = ({**item, "loc": (*name, *item["loc"])} for item in error.errors())
@@ -158,6 +158,15 @@ class _Called(ModelMetaclass):
 
 
 class Section(BaseModel, metaclass=_Called):
-    """A section of the file: immutable, and an unknown key is an error."""
+    """A section of the file: immutable, and an unknown key is an error.
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    The docstring below a key is its description, which `iscat config` prints beside it.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        """Write descriptions in one line."""
+        for field in cls.model_fields.values():
+            field.description = " ".join((field.description or "").split())

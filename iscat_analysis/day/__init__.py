@@ -16,8 +16,7 @@ from typing import Any
 import pandas as pd
 
 from iscat_analysis.calibration.line import Line, with_line
-from iscat_analysis.config import configure
-from iscat_analysis.config.overrides import Source
+from iscat_analysis.config import Source, configure
 from iscat_analysis.day.calibrate import Day, calibrate_day
 from iscat_analysis.day.compare import Reaction, kd_name, reaction_of
 from iscat_analysis.day.gather import Found, read_movie

@@ -16,8 +16,7 @@ import pandas as pd
 
 from iscat_analysis.answers.calibrations import camera_calibration, mass_calibration
 from iscat_analysis.calibration import contrast_over, standards_of
-from iscat_analysis.config import Calibration, Config, load_config
-from iscat_analysis.config.files import read_toml
+from iscat_analysis.config import Calibration, Config, load_config, read_toml
 from iscat_analysis.day.jobs import Outcome, Runner, hash_of, sha256_of
 from iscat_analysis.day.table import Movie, Plan, configured
 from iscat_analysis.errors import DataError, SignError

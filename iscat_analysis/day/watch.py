@@ -27,8 +27,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.calibration.line import Line, mass_line
-from iscat_analysis.config import Config, configure
-from iscat_analysis.config.overrides import Source
+from iscat_analysis.config import Config, Source, configure
 from iscat_analysis.day import Batch, batch
 from iscat_analysis.day.compare import reaction_of
 from iscat_analysis.day.jobs import Records, claim_folder

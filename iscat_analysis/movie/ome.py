@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.config.values import WAVELENGTH_NM
+from iscat_analysis.config import WAVELENGTH_NM
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.descriptions import (
     LENGTH_NM,

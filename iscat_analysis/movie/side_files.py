@@ -24,7 +24,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from iscat_analysis.config.values import WAVELENGTH_NM
+from iscat_analysis.config import WAVELENGTH_NM
 from iscat_analysis.reading import is_file, json_of, read_text
 from iscat_analysis.records import StackMetadata
 

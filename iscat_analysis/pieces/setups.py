@@ -8,8 +8,15 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from iscat_analysis.config import Calibration, CameraConfig, Config, Fit, Optics, Particle
-from iscat_analysis.config.values import LARGEST_NM
+from iscat_analysis.config import (
+    LARGEST_NM,
+    Calibration,
+    CameraConfig,
+    Config,
+    Fit,
+    Optics,
+    Particle,
+)
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import LARGEST, choice_in, real_array
 from iscat_analysis.records import FREE_PARAMETERS

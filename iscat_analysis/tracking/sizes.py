@@ -19,8 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.config import Config
-from iscat_analysis.config.schema import INVISIBLE
+from iscat_analysis.config import INVISIBLE, Config
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event
 from iscat_analysis.inference.common_size import (

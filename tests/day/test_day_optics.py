@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import iscat_analysis as ia
-from iscat_analysis.config.files import read_toml
+from iscat_analysis.config import read_toml
 from iscat_analysis.instrument.microscope import REJECTED_P
 
 pytestmark = [pytest.mark.large, pytest.mark.usefixtures("sketched")]

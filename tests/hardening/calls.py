@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 import iscat_analysis as ia
-from iscat_analysis.config.complaints import known_keys
+from iscat_analysis.config import known_keys
 
 Generator = np.random.Generator
 Call = tuple[Callable[..., Any], dict[str, Any]]

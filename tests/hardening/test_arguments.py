@@ -16,8 +16,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from iscat_analysis import config as config_module
-from iscat_analysis.config import Config, config_to_toml, load_config, parse_config
-from iscat_analysis.config.complaints import known_keys
+from iscat_analysis.config import Config, config_to_toml, known_keys, load_config, parse_config
 from iscat_analysis.errors import ConfigError, IscatError
 from iscat_cli import main, main_fit
 from iscat_cli.app import COMMANDS
