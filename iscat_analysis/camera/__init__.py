@@ -64,8 +64,16 @@ from iscat_analysis.camera.learned import (
     resolve_metadata,
     with_camera,
 )
-from iscat_analysis.camera.light import Surface, find_surface
-from iscat_analysis.camera.lines import Lines, PartOfLines, SteadyFrames, find_lines
+from iscat_analysis.camera.light import (
+    Fringes,
+    LightModel,
+    PartOfLight,
+    Seams,
+    Smooth,
+    SteadyFrames,
+    with_lines,
+)
+from iscat_analysis.camera.light_search import find_light
 from iscat_analysis.camera.pixels import (
     boxes_of,
     find_text,

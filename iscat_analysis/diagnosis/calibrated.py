@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from iscat_analysis.camera import (
     Camera,
     LearnedCamera,
-    Lines,
+    LightModel,
     Processing,
     Response,
     camera_from_config,
@@ -104,7 +104,7 @@ class Prepared:
     stretches: Stretches = field(default_factory=lambda: Stretches(()))
     kept: KeptFrames | None = None
     processing: Processing | None = None
-    lines: Lines | None = None
+    lines: LightModel | None = None
     opening: NoiseSurvey | None = None
     changes: Future[Changes] | None = None
     other_kind: str = ""

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from iscat_analysis.camera import (
     LARGEST_PX,
     Camera,
-    Lines,
+    LightModel,
     SteadyFrames,
-    find_lines,
-    find_surface,
+    find_light,
     find_unsteady,
     unsteady_finding,
     whole_frames,
+    with_lines,
 )
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES
@@ -62,7 +62,7 @@ class JudgedLight:
     """A movie without its unsteady pixels, and with its unsteady light divided out."""
 
     movie: Stack
-    lines: Lines | None
+    lines: LightModel | None
     findings: tuple[Finding, ...]
     steady: Stack
 
@@ -91,7 +91,7 @@ def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
 
 def judge_lines(
     movie: Stack, config: Config, camera: Camera, pairs: Sequence[Pair], window: int
-) -> Lines | None:
+) -> LightModel | None:
     """Find rows, columns and smooth light that change and may be divided out."""
     background = config.background
     mode = background_mode(config)
@@ -109,8 +109,8 @@ def judge_lines(
     if not len(counts):
         return None
     with one_thread_algebra():
-        surface = find_surface([(p.before, p.after) for p in pairs], camera, window)
-        return find_lines(counts, camera, surface)
+        surface = find_light([(p.before, p.after) for p in pairs], camera, window)
+        return with_lines(counts, camera, surface)
 
 
 def _apart(pairs: Sequence[Pair]) -> list[NDArray[Any]]:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from iscat_analysis.camera import Lines, NoiseSpectrum, PartOfLines
+from iscat_analysis.camera import LightModel, NoiseSpectrum, PartOfLight
 from iscat_analysis.config import Config, Detection
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import KNOWN, MEAN, MEDIAN
@@ -49,7 +49,7 @@ class AnalysisContext:
     templates: Templates
     mode: str
     searches: int = 1
-    lines: Lines | PartOfLines | None = None
+    lines: LightModel | PartOfLight | None = None
     # of fitted regions, of their surroundings, and of all that is seen far away
     local: tuple[LocalModels | ModelsFrom, ...] | None = None
 
@@ -74,7 +74,7 @@ class AnalysisContext:
         if isinstance(local, tuple):
             corner_nm = tile.corner[0] * self.pixel_nm, tile.corner[1] * self.pixel_nm
             local = tuple(ModelsFrom(m, corner_nm) for m in local if isinstance(m, LocalModels))
-        if isinstance(lines, Lines):
+        if isinstance(lines, LightModel):
             lines = lines.part(tile.here)
         if noise is not None:
             noise = noise.on(tile.shape)
@@ -146,7 +146,7 @@ def make_context(
     *,
     searches: int = 1,
     noise: NoiseSpectrum | None = None,
-    lines: Lines | None = None,
+    lines: LightModel | None = None,
     sliding: bool = False,
 ) -> AnalysisContext:
     """Build the models and the matched filter for a field."""

@@ -11,7 +11,7 @@ from itertools import compress
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.camera import Camera, Lines, NoiseSpectrum, Trajectory
+from iscat_analysis.camera import Camera, LightModel, NoiseSpectrum, Trajectory
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis import misfit_warning
 from iscat_analysis.fitting.context import AnalysisContext, make_context
@@ -127,7 +127,7 @@ class ChunkSetting:
     window: int
     noise: NoiseSpectrum | None
     excess_noise: ExcessNoise | None
-    lines: Lines | None
+    lines: LightModel | None
 
     @cached_property
     def reader(self) -> Reader:

@@ -22,7 +22,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.camera import Camera, Lines, SteadyFrames, Trajectory
+from iscat_analysis.camera import Camera, LightModel, SteadyFrames, Trajectory
 from iscat_analysis.config import LARGEST_SD_NM, Config, with_absolute_paths
 from iscat_analysis.diagnosis import DRIFT_PX, NoiseSurvey, Prepared, pixel_warnings, survey_over
 from iscat_analysis.errors import FloodError
@@ -213,7 +213,7 @@ def analyse_landings(
     prepare: Callable[[AnalysisContext], None] = _do_nothing,
     partial: Path | None = None,
     identity: str = "",
-    lines: Lines | None = None,
+    lines: LightModel | None = None,
     executor: Executor | None = None,
     opening: NoiseSurvey | None = None,
     stretches: Sequence[tuple[int, int]] = (),

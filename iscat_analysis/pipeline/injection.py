@@ -20,7 +20,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.bounds import power_searched
-from iscat_analysis.camera import Camera, Lines, Mover, Trajectory
+from iscat_analysis.camera import Camera, LightModel, Mover, Trajectory
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis import Prepared
 from iscat_analysis.executors import Executor
@@ -175,7 +175,7 @@ def inject_and_recover(
     particles = draw_particles(
         result.context, (movie.shape[1], movie.shape[2]), frames, window, count, result.fits, seed
     )
-    lines = result.context.lines if isinstance(result.context.lines, Lines) else None
+    lines = result.context.lines if isinstance(result.context.lines, LightModel) else None
     again = analyse_landings(
         InjectedMovie(movie, camera, particles, seed, result.trajectory),
         config.model_copy(update={"background": fixed}),

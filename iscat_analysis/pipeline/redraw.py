@@ -17,7 +17,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.camera import LARGEST_PX, Camera, CutFrames, Lines, add_frames, refine_power
+from iscat_analysis.camera import (
+    LARGEST_PX,
+    Camera,
+    CutFrames,
+    LightModel,
+    add_frames,
+    refine_power,
+)
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis import calibrated
 from iscat_analysis.errors import DataError
@@ -99,7 +106,7 @@ def _landings(
     movie: Stack,
     config: Config,
     camera: Camera,
-    lines: Lines | None,
+    lines: LightModel | None,
     table: pd.DataFrame,
     window: int,
     stretches: Sequence[Sequence[int]],
@@ -186,7 +193,7 @@ def _step(neighbours: Neighbours, row: pd.Series[Any], corner: tuple[int, int]) 
 
 
 def _before_after(
-    movie: Stack, config: Config, camera: Camera, lines: Lines | None, table: pd.DataFrame
+    movie: Stack, config: Config, camera: Camera, lines: LightModel | None, table: pd.DataFrame
 ) -> Redraw:
     """Draw rows over a background of other frames; in mode ``track`` each in its frame."""
     before, after = frame_ranges(movie, config)
@@ -251,7 +258,7 @@ def _moving(
     movie: Stack,
     config: Config,
     camera: Camera,
-    lines: Lines | None,
+    lines: LightModel | None,
     table: pd.DataFrame,
     tracks: pd.DataFrame | None,
     blocks: int,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.special import chdtri
 
-from iscat_analysis.camera import Camera, Lines, find_defects
+from iscat_analysis.camera import Camera, LightModel, find_defects
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext, make_context
@@ -48,7 +48,7 @@ def exposure_of(config: Config) -> tuple[float, float]:
 
 
 def tracking_context(
-    config: Config, field_px: tuple[int, int], frames: int, lines: Lines | None = None
+    config: Config, field_px: tuple[int, int], frames: int, lines: LightModel | None = None
 ) -> AnalysisContext:
     """Make models and matched filter for single frames."""
     fit = config.fit.model_copy(update={"mode": config.track.free})

@@ -10,7 +10,7 @@ from scipy.ndimage import fourier_shift, gaussian_filter
 from wanderers import SETTINGS, wander
 
 import iscat_analysis as ia
-from iscat_analysis.camera import Camera, Lines, Surface, find_surface
+from iscat_analysis.camera import Camera, LightModel, Seams, Smooth, find_light
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.study import Movie
@@ -50,8 +50,10 @@ def test_a_polynomial_is_measured_exactly() -> None:
     light[10, 20] = 0.0  # not used
     factor = 1 + 0.02 * X - 0.01 * Y**2 * X + 0.03 * X * Y
     factor /= np.average(factor, weights=light)
-    np.testing.assert_allclose(Surface(light, 3).factors(light * factor), factor, atol=1e-12)
-    assert np.abs(Surface(light, 2).factors(light * factor) - factor).max() > 1e-4
+    np.testing.assert_allclose(
+        LightModel(light, Smooth(3)).factors(light * factor), factor, atol=1e-12
+    )
+    assert np.abs(LightModel(light, Smooth(2)).factors(light * factor) - factor).max() > 1e-4
 
 
 @pytest.mark.parametrize(
@@ -63,12 +65,12 @@ def test_a_polynomial_is_measured_exactly() -> None:
     ],
 )
 def test_smooth_changes_are_found_with_their_size(factor: Array, degrees: tuple[int, int]) -> None:
-    found = find_surface(_pairs(_changed(factor), 2), Camera(), WINDOW)
+    found = find_light(_pairs(_changed(factor), 2), Camera(), WINDOW)
     assert found is not None
-    assert degrees[0] <= found.degree <= degrees[1]
+    assert degrees[0] <= found.smooth.degree <= degrees[1]
     weight = _light()
     spread = np.sqrt(np.average((factor - np.average(factor, weights=weight)) ** 2, weights=weight))
-    assert found.rms == pytest.approx(spread, rel=0.05)
+    assert found.smooth.rms == pytest.approx(spread, rel=0.05)
 
 
 def _fringes(period_px: float, phase: float, bent: float = 0.0) -> Array:
@@ -87,7 +89,7 @@ def test_fringes_are_found_and_measured(period_px: float, bent: float) -> None:
         (_light() * _fringes(period_px, one, bent), _light() * _fringes(period_px, other, bent))
         for one, other in phases
     ]
-    found = find_surface(_pairs(light, 8), Camera(), WINDOW)
+    found = find_light(_pairs(light, 8), Camera(), WINDOW)
     assert found is not None
     assert found.fringes.periods_px == pytest.approx([period_px], rel=0.01)
     assert bool(found.fringes.degree) == bool(bent)
@@ -111,9 +113,9 @@ def test_parts_of_a_camera_are_told_by_their_seams(
         return np.asarray(drawn[np.ix_(*parts)])
 
     light = [(_light() * gains(), _light() * gains()) for _ in range(2 * PAIRS)]
-    found = find_surface(_pairs(light, 9), Camera(), WINDOW)
+    found = find_light(_pairs(light, 9), Camera(), WINDOW)
     assert found is not None
-    assert found.amplifier_boundaries == seams
+    assert (found.seams.rows, found.seams.columns) == seams
     factor = gains()
     factor /= np.average(factor, weights=found.light_e)
     np.testing.assert_allclose(found.factors(found.light_e * factor), factor, atol=1e-9)
@@ -126,15 +128,15 @@ def test_seams_and_fringes_hide_nothing_from_each_other() -> None:
         halves = np.repeat(1 + 5e-3 * rng.standard_normal((2, 1)), SHAPE[0] // 2, axis=0)
         return np.asarray(_light() * halves * _fringes(25.0, rng.uniform(0, 6)))
 
-    found = find_surface(_pairs([(light(), light()) for _ in range(PAIRS)], 10), Camera(), WINDOW)
+    found = find_light(_pairs([(light(), light()) for _ in range(PAIRS)], 10), Camera(), WINDOW)
     assert found is not None
-    assert found.amplifier_boundaries == ((48,), ())
+    assert found.seams == Seams((48,), ())
     assert found.fringes.periods_px == pytest.approx([25.0], rel=0.01)
 
 
 def test_nothing_is_found_in_steady_light() -> None:
     still = [(_light(), _light())] * PAIRS
-    assert all(find_surface(_pairs(still, seed), Camera(), WINDOW) is None for seed in range(12))
+    assert all(find_light(_pairs(still, seed), Camera(), WINDOW) is None for seed in range(12))
 
 
 def test_particles_and_pixels_that_blink_are_no_light() -> None:
@@ -147,23 +149,23 @@ def test_particles_and_pixels_that_blink_are_no_light() -> None:
             factor -= 0.03 * np.exp(-(((Y + 1) * 48 - y) ** 2 + ((X + 1) * 64 - x) ** 2) / 2)
         factor[rng.integers(0, 96, 10), rng.integers(0, 128, 10)] *= 1.5
         light.append((_light(), _light() * factor))
-    assert find_surface(_pairs(light, 4), Camera(), WINDOW) is None
+    assert find_light(_pairs(light, 4), Camera(), WINDOW) is None
 
 
 def test_dust_that_lands_is_no_light() -> None:
     """Its rim is smooth, and it is nowhere but in one pair."""
     dust = 1 - 0.3 * np.exp(-((64 * X + 20) ** 2 + (48 * Y - 10) ** 2) / (2 * 6**2))
     light = [(_light(), _light() * (dust if k == 5 else 1)) for k in range(PAIRS)]
-    assert find_surface(_pairs(light, 11), Camera(), WINDOW) is None
+    assert find_light(_pairs(light, 11), Camera(), WINDOW) is None
 
 
 def test_what_is_added_to_all_pixels_is_taken_off() -> None:
     added = 0.02 * LEVEL_E
     light = [(_light(), _light() + added), (_light() + added, _light())] * (PAIRS // 2)
-    found = find_surface(_pairs(light, 12), Camera(), WINDOW)
+    found = find_light(_pairs(light, 12), Camera(), WINDOW)
     assert found is not None
-    assert found.degree == 0
-    assert found.stray_light == pytest.approx(0.02, rel=0.15)
+    assert found.smooth.degree == 0
+    assert found.added == pytest.approx(0.02, rel=0.15)
     frame = found.light_e + added
     even = frame / found.factors(frame) / found.light_e
     assert np.std(even) < 1e-9 < np.std(frame / found.light_e)
@@ -176,14 +178,14 @@ def test_particles_on_light_without_a_pattern_are_nothing_that_is_added(count: i
     for y, x in zip(rng.uniform(0, 96, count), rng.uniform(0, 128, count), strict=True):
         factor -= 0.02 * np.exp(-(((Y + 1) * 48 - y) ** 2 + ((X + 1) * 64 - x) ** 2) / 4)
     flat = np.full(SHAPE, LEVEL_E)
-    assert find_surface(_pairs([(flat, flat * factor)] * PAIRS, 13), Camera(), WINDOW) is None
+    assert find_light(_pairs([(flat, flat * factor)] * PAIRS, 13), Camera(), WINDOW) is None
 
 
 @pytest.mark.parametrize("grain_px", [1.5, 4.0])
 def test_a_pattern_that_moves_is_not_taken_for_light(grain_px: float) -> None:
     still = _light(grain_px)
     moved = np.fft.ifft2(fourier_shift(np.fft.fft2(still), (0.1, 0.25))).real
-    assert find_surface(_pairs([(still, moved)] * PAIRS, 5), Camera(), WINDOW) is None
+    assert find_light(_pairs([(still, moved)] * PAIRS, 5), Camera(), WINDOW) is None
 
 
 def test_what_is_left_of_a_particle_is_foreseen() -> None:
@@ -191,7 +193,7 @@ def test_what_is_left_of_a_particle_is_foreseen() -> None:
     context = make_context(make_config(), SHAPE)
     grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
     signal = context.wide.image(grid, 9 * PIXEL_NM, 7 * PIXEL_NM, 5.0, 1000.0)
-    lines = Lines(_light(), (0.0, 0.0), Surface(_light(), 10))
+    lines = LightModel(_light(), Smooth(10))
     changed = 1 + 0.01 * X * Y
     frames = _light() * changed * np.stack([np.ones(SHAPE), 1 + signal])
     before, after = (f / f.sum() for f in frames / lines.factors(frames))
@@ -226,7 +228,7 @@ def test_particles_that_land_in_wandering_light(monkeypatch: pytest.MonkeyPatch)
     assert (abs(table["mass_kda"] - 500.0) < 4 * table["sigma_mass_kda"]).all()
     assert result.summary["lines"]["smooth_degree"] >= 1
     assert any("changes slowly over the field" in text for text in result.warnings)
-    monkeypatch.setattr("iscat_analysis.diagnosis.light.find_surface", lambda *_: None)
+    monkeypatch.setattr("iscat_analysis.diagnosis.light.find_light", lambda *_: None)
     without = ia.fit_movie(counts, config=config)
     assert (without.table["status"] == "ok").sum() < 2
 
@@ -253,7 +255,7 @@ def test_fringes_that_change_between_a_background_and_what_follows(
     row = result.table.iloc[0]
     assert abs(row["mass_kda"] - 500) < 4 * row["sigma_mass_kda"]
     assert result.summary["lines"]["fringe_periods_px"] == pytest.approx([16.0], rel=0.01)
-    monkeypatch.setattr("iscat_analysis.diagnosis.light.find_surface", lambda *_: None)
+    monkeypatch.setattr("iscat_analysis.diagnosis.light.find_light", lambda *_: None)
     without = ia.fit_movie(counts, config=config)
     assert list(without.table["status"]) != ["ok"]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scenes import PIXEL_NM, Stack, make_config
 
 import iscat_analysis as ia
-from iscat_analysis.camera import Camera, Lines, SteadyFrames, find_lines
+from iscat_analysis.camera import Camera, LightModel, SteadyFrames, with_lines
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.optics.grid import PixelGrid
 
@@ -40,7 +40,7 @@ def _movie(
 def test_a_line_keeps_its_share_of_the_light(kind: str) -> None:
     """After the correction no line flickers, not even by its shot noise; the frames still do."""
     counts = _movie(1, **{kind: 2e-3}, power=0.02)
-    lines = find_lines(counts, CAMERA)
+    lines = with_lines(counts, CAMERA)
     assert lines is not None
     share = 4e-6 * LEVEL_E / (1 + 4e-6 * LEVEL_E)
     assert lines.shares[kind == "columns"] == pytest.approx(share, rel=0.1)
@@ -58,14 +58,14 @@ def test_a_line_keeps_its_share_of_the_light(kind: str) -> None:
 
 
 def test_lines_that_do_not_flicker_are_left_alone() -> None:
-    assert all(find_lines(_movie(seed, power=0.02), CAMERA) is None for seed in range(12))
+    assert all(with_lines(_movie(seed, power=0.02), CAMERA) is None for seed in range(12))
 
 
 def test_saturated_and_empty_pixels_stay_what_they_are() -> None:
     counts = _movie(3, rows=3e-3)
     counts[:, 5, 6] = 65535
     counts[10] = 0
-    lines = find_lines(counts[11:], CAMERA)
+    lines = with_lines(counts[11:], CAMERA)
     assert lines is not None
     assert lines.light_e[5, 6] == 0
     steady = SteadyFrames(Stack(counts), lines, CAMERA).read(0, 64)
@@ -81,7 +81,7 @@ def test_what_is_left_of_a_particle_is_foreseen() -> None:
     context = make_context(make_config(), SHAPE)
     grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
     signal = context.wide.image(grid, 30 * PIXEL_NM, 24 * PIXEL_NM, 5.0, 1000.0)
-    lines = Lines(_light(), (0.3, 0.0))
+    lines = LightModel(_light(), shares=(0.3, 0.0))
     left = lines.left(signal)
     rng = np.random.default_rng(4)
     flicker = 1 + 1e-3 * rng.standard_normal((2, SHAPE[0], 1))
@@ -110,7 +110,7 @@ def test_lines_are_found_as_often_by_chance_as_the_normal_law_says(
     rng = np.random.default_rng(6)
     for _ in range(trials):
         counts = rng.normal(LEVEL_E, math.sqrt(LEVEL_E), (16, 24, 24))
-        lines = find_lines(counts, Camera())
+        lines = with_lines(counts, Camera())
         found += 0 if lines is None else np.count_nonzero(lines.shares)
     expected = 2 * trials * 0.02275
     assert abs(found - expected) < 4 * math.sqrt(expected)

@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import poisson
 
 import iscat_analysis as ia
-from iscat_analysis.camera import Lines
+from iscat_analysis.camera import LightModel
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.diagnosis import judge_lines
 from iscat_analysis.errors import DataError
@@ -143,7 +143,7 @@ def test_masses_are_too_low_where_what_is_left_is_not_foreseen(
     """Control: rows and columns take 2 × 2.8 pixels of 88 off a particle, 6 % of its mass."""
     for method in ("left", "taken"):
         monkeypatch.setattr(
-            f"iscat_analysis.camera.lines.Lines.{method}",
+            f"iscat_analysis.camera.light.LightModel.{method}",
             lambda _, signal, method=method: signal if method == "left" else np.ones_like(signal),
         )
     table = _fitted(kind, "both", 6)
@@ -166,7 +166,7 @@ def test_lines_that_are_divided_out_of_a_moving_pattern_make_particles(
 ) -> None:
     """Control: of the test above, and of its own movie without flicker."""
 
-    def divided(movie: Stack, config: Config, *others: Any) -> Lines | None:
+    def divided(movie: Stack, config: Config, *others: Any) -> LightModel | None:
         background = config.background.model_copy(update={"drift_correction": False})
         return judge_lines(movie, config.model_copy(update={"background": background}), *others)
 
