@@ -13,7 +13,7 @@ from bokeh.plotting import figure
 
 import iscat_analysis as ia
 from iscat_analysis.answers.gates import MassHistogram, counted_events, counted_rows, mass_histogram
-from iscat_analysis.report.gates import PALETTES
+from iscat_analysis.report.species import PALETTES
 from iscat_analysis.species.tables import EventTable
 from iscat_app.binding import BindingPart
 from iscat_app.chosen import Chosen, Notice, in_line, link_to, table_of

@@ -12,7 +12,7 @@ import panel as pn
 import iscat_analysis as ia
 from iscat_analysis.config import config_to_toml
 from iscat_analysis.movie import path_beside
-from iscat_analysis.report.gates import FONTS, PALETTES, Format, figure_bytes, histogram_figure
+from iscat_analysis.report.species import FONTS, PALETTES, Format, figure_bytes, histogram_figure
 from iscat_app.chosen import Chosen, Notice, in_line
 from iscat_app.compare import Compare
 from iscat_app.results import Results
@@ -98,8 +98,8 @@ class Export:
         if results.histogram is None or results.result is None:
             raise ia.DataError("there is no histogram yet")
         shape: dict[str, Any] = {
-            "width_cm": self._width.value, "height_cm": self._height.value,
-            "font_pt": self._font.value, "font": self._family.value,
+            "size_cm": (self._width.value, self._height.value),
+            "font": (self._family.value, self._font.value),
             "palette": self._palette.value, "density": self._density.value,
         }  # fmt: skip
         if self._what.value == _SEVERAL:

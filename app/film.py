@@ -22,7 +22,7 @@ from bokeh.plotting import figure
 
 import iscat_analysis as ia
 from iscat_analysis.pipeline.preview import RatioFilm
-from iscat_analysis.report.pictures import SHOWN_FRAMES
+from iscat_analysis.report.figures import SHOWN_FRAMES
 from iscat_app.chosen import Chosen, Notice
 
 RATES = (5, 10, 25, 50, 100, 250, 1000)

@@ -19,7 +19,7 @@ from tornado.web import RequestHandler
 from tornado.websocket import WebSocketClosedError
 
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.report.view import PAGES
+from iscat_analysis.report.output import PAGES
 from iscat_app.page import page_of
 from iscat_app.runs import Queue
 

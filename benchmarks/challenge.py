@@ -25,7 +25,7 @@ from typing import Any
 
 import pandas as pd
 
-from iscat_analysis.report.estimators import contest_parts
+from iscat_analysis.report.benchmark import contest_parts
 from iscat_contest.challenge import ABOUT
 from iscat_contest.estimators import known_estimators
 

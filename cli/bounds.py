@@ -299,8 +299,8 @@ def _optics_lines(report: Mapping[str, Any]) -> Iterator[RenderableType]:
 def _paper(messages: Messages, out: Path, *, overwrite: bool) -> None:
     """Reproduce a paper."""
     from iscat_analysis.bounds.paper import FIELD_NM, reproduce
+    from iscat_analysis.report.bounds import PAPER_FILES, write_paper
     from iscat_analysis.report.output import check_output
-    from iscat_analysis.report.paper import PAPER_FILES, write_paper
 
     check_output(out, overwrite, known=PAPER_FILES)
     with messages.progress() as progress:

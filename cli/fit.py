@@ -168,7 +168,7 @@ def fit(
     flagged = list(filter(_is_flagged, rows))
     messages.note(*_advice(flagged))
     if tracks is not None:
-        from iscat_analysis.report.tracks import advice
+        from iscat_analysis.report.answer import advice
 
         messages.note(*advice(tracks))
         flagged += filter(_is_flagged, found["tracks"])
@@ -214,18 +214,24 @@ def _event_lines(analysis: Analysis, folder: Path) -> Iterator[RenderableType]:
 
     from iscat_analysis.config import MODES
     from iscat_analysis.records import counted, tally
-    from iscat_analysis.report.answer import answers, caution, main_quantity
+    from iscat_analysis.report.answer import (
+        answers,
+        as_contrasts,
+        as_diameters,
+        caution,
+        main_quantity,
+        not_a_mass,
+    )
     from iscat_analysis.report.answer import is_uncalibrated as uncalibrated
-    from iscat_analysis.report.headline import NOT_A_MASS, as_contrasts, as_diameters
 
     found = tally(analysis.table)
     if found.number:
         console = Console()
         if (flagged := caution(analysis.table)) is not None:
-            yield flagged
+            yield f"{flagged.text}."
         shown, mass = counted(analysis.table).head(ROWS_SHOWN), ("mass", "kDa")
         if uncalibrated(analysis):
-            yield NOT_A_MASS
+            yield from not_a_mass(analysis)
             mass = ("mass, model scale", "kDa")
             if main_quantity(analysis).column == "contrast":
                 shown, mass = as_contrasts(shown), ("contrast", "")
@@ -243,9 +249,8 @@ def _event_lines(analysis: Analysis, folder: Path) -> Iterator[RenderableType]:
 def _track_lines(analysis: Analysis, folder: Path) -> Iterator[RenderableType]:
     """Print the first tracks, and what all of them say together."""
     from iscat_analysis.records import tally
-    from iscat_analysis.report.answer import main_quantity, tracks_of
+    from iscat_analysis.report.answer import headline, main_quantity, track_lines, tracks_of
     from iscat_analysis.report.tables import event_table
-    from iscat_analysis.report.tracks import track_lines, tracks_headline
 
     tracks = tracks_of(analysis)
     if len(tracks):
@@ -253,14 +258,14 @@ def _track_lines(analysis: Analysis, folder: Path) -> Iterator[RenderableType]:
         yield tracks_table(tracks.head(ROWS_SHOWN), contrast=contrast)
     if len(tracks) > ROWS_SHOWN:
         yield f"… and {len(tracks) - ROWS_SHOWN} more in {folder / 'tracks.csv'}"
-    yield from tracks_headline(analysis, event_table(analysis))
+    yield from headline(analysis, event_table(analysis))
     yield from track_lines(analysis.summary)
     yield f"{tally(tracks).text('track')}; results in {folder}"
 
 
 def tracks_table(tracks: pd.DataFrame, *, contrast: bool = False) -> Table:
     """Tabulate rows of ``tracks.csv``: mass or contrast, D, diameter and index if known."""
-    from iscat_analysis.report.tracks import TRACK_HEADINGS
+    from iscat_analysis.report.answer import TRACK_HEADINGS
 
     rows = tracks.to_dict("records")
     columns: dict[str, list[str]] = {

@@ -71,7 +71,7 @@ def view(result: Path) -> None:
     import webbrowser
 
     from iscat_analysis.errors import DataError
-    from iscat_analysis.report.view import page_of
+    from iscat_analysis.report.output import page_of
 
     page = page_of(result)
     print_result(str(page))

@@ -53,7 +53,7 @@ _MOST_AT_ONCE = 1000
 _BASE_MB = 400  # of a process, beside the pixels
 _LIBRARIES = "iscat-analysis[dask]"
 _LARGE_BYTES = 60e6  # of a movie whose job is worth the start of a process
-_IMPORTED = ("iscat_analysis.report.page", "iscat_analysis.landing.chunks")
+_IMPORTED = ("iscat_analysis.report.movie_page", "iscat_analysis.landing.chunks")
 _LOST = (
     "the second process was ended from outside, most likely because memory ran out; its part is "
     "done again in the first"

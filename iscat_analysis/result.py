@@ -28,14 +28,19 @@ from iscat_analysis.records import (
     tally,
 )
 from iscat_analysis.report import write_report
-from iscat_analysis.report.answer import caution, main_quantity, tracks_of
+from iscat_analysis.report.answer import (
+    as_contrasts,
+    caution,
+    headline,
+    label_of,
+    main_quantity,
+    precision_of,
+    tracks_of,
+)
 from iscat_analysis.report.exchange import to_napari, to_trackpy
-from iscat_analysis.report.headline import as_contrasts, headline, label_of, precision_of
+from iscat_analysis.report.figures import draw, draw_corner, draw_view, posterior_of, view_of
 from iscat_analysis.report.numbers import UNITS, number
-from iscat_analysis.report.pictures import draw, draw_corner, draw_event, posterior_of, view_of
-from iscat_analysis.report.posterior import posterior_groups
-from iscat_analysis.report.tables import event_table
-from iscat_analysis.report.tracks import tracks_headline
+from iscat_analysis.report.tables import event_table, posterior_groups
 from iscat_analysis.text import in_page
 from iscat_analysis.units import count
 
@@ -151,7 +156,8 @@ class Result:
         DataError
             There is no such event.
         """
-        return draw_event(self.analysis, event)
+        view = view_of(self.analysis, event)
+        return draw_view(view, self.analysis.scheme, self.analysis.pixel_size_nm)
 
     def overview(self) -> Figure:
         """Draw the field of view, its events numbered.
@@ -282,8 +288,7 @@ class Result:
 
     def _facts(self) -> list[tuple[str, str]]:
         table, tracked = event_table(self.analysis), self.analysis.tracks is not None
-        headlines = tracks_headline if tracked else headline
-        facts = [("", text) for text in headlines(self.analysis, table)] if len(self) else []
+        facts = [("", text) for text in headline(self.analysis, table)] if len(self) else []
         rows = tally(self.tracks if tracked else table)
         facts.append(("status", rows.text("track" if tracked else "event")))
         for name in FREE_PARAMETERS[self.mode] if caution(table) is None else ():

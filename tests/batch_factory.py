@@ -10,8 +10,7 @@ import pandas as pd
 
 from iscat_analysis.day.compare import match_species, shifts
 from iscat_analysis.day.gather import MOVIE_COLUMNS, SPECIES_COLUMNS
-from iscat_analysis.report.batch import batch_page, summary_line
-from iscat_analysis.report.batch_figures import Curve
+from iscat_analysis.report.batch import BatchContents, Curve, batch_page, summary_line
 
 
 def make_batch_page(number: int, *, replicates: int = 3, folder: Path | None = None) -> str:
@@ -65,9 +64,7 @@ def make_batch_page(number: int, *, replicates: int = 3, folder: Path | None = N
     found = pd.DataFrame(species).reindex(columns=[n for n in SPECIES_COLUMNS if n != "kind"])
     found = match_species(found)
     failed = [(row["movie"], row["why"]) for row in movies if row["state"] == "failed"]
-    return batch_page(
-        "samples",
-        subtitle=summary_line(table),
+    contents = BatchContents(
         curves=curves,
         movies=table,
         species=found.assign(group=found["condition"]),
@@ -77,6 +74,7 @@ def make_batch_page(number: int, *, replicates: int = 3, folder: Path | None = N
             ("optics", "confirmed by BSA", ""),
         ],
         failed=failed,
+        equilibria=(),
         mass_label="mass [kDa]",
-        folder=folder,
     )
+    return batch_page("samples", summary_line(table), contents, folder)

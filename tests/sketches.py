@@ -12,22 +12,12 @@ import pytest
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from iscat_analysis.report import page
+from iscat_analysis.report import movie_page
 from iscat_analysis.report.style import Sketch
 
 PAGES = tuple(
     importlib.import_module(f"iscat_analysis.report.{name}")
-    for name in (
-        "batch",
-        "benchmark",
-        "bounds",
-        "calibration",
-        "estimators",
-        "optics",
-        "page",
-        "paper",
-        "template",
-    )
+    for name in ("batch", "benchmark", "bounds", "calibration", "movie_page")
 )
 """Modules that publish figures."""
 
@@ -75,6 +65,6 @@ def undrawn(sketches: Iterable[Sketch]) -> Iterator[tuple[str, Figure]]:
 
 def sketch_figures(patch: pytest.MonkeyPatch, *, pause_s: float = 0.0) -> None:
     """Let every report be written without its figures, with a pause after each of their files."""
-    patch.setattr(page, "drawn", undrawn)
+    patch.setattr(movie_page, "drawn", undrawn)
     for module in PAGES:
         patch.setattr(module, "publish", partial(sketch, pause_s=pause_s))

@@ -11,7 +11,7 @@ import pandas as pd
 
 from iscat_analysis import DataError, Status, StoredResult, open_result, open_stack, tracked_rows
 from iscat_analysis.pipeline.preview import film_limits
-from iscat_analysis.report.pictures import SHOWN_FRAMES
+from iscat_analysis.report.figures import SHOWN_FRAMES
 from iscat_napari.frames import LazyMovie
 
 LayerData = tuple[Any, dict[str, Any], str]

@@ -24,7 +24,7 @@ from iscat_analysis.movie.text_tables import read_frame, refuse_twice
 from iscat_analysis.reading import is_file, is_folder, read_json
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.report import atomic_folder, check_output
-from iscat_analysis.report.binding import binding_figure
+from iscat_analysis.report.species import binding_figure
 from iscat_analysis.report.style import publish
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.schemas import jsonable, to_json

@@ -32,9 +32,7 @@ from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.optics.measured import sha256_of
 from iscat_analysis.records import FloatArray, Progress, silent
 from iscat_analysis.report import atomic_folder, check_output
-from iscat_analysis.report.calibration import camera_page, mass_page
-from iscat_analysis.report.optics import optics_page
-from iscat_analysis.report.template import template_page
+from iscat_analysis.report.calibration import camera_page, mass_page, optics_page, template_page
 from iscat_analysis.schemas import jsonable, to_json
 
 CAMERA_FILES = frozenset(

@@ -15,7 +15,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.records import FloatArray, Progress, silent
 from iscat_analysis.report import atomic_folder, check_output
-from iscat_analysis.report.comparison import comparison_figure
+from iscat_analysis.report.species import comparison_figure
 from iscat_analysis.report.style import publish
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.schemas import jsonable, to_json

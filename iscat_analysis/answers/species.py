@@ -15,7 +15,7 @@ from iscat_analysis.calibration.line import Line
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import choice_in, number_in, path_in, shown, truth_in
 from iscat_analysis.report import atomic_folder, check_output
-from iscat_analysis.report.distribution import species_figure
+from iscat_analysis.report.species import species_figure
 from iscat_analysis.report.style import drawn, publish
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.schemas import jsonable, to_json

@@ -31,8 +31,7 @@ from iscat_analysis.day.gather import (
 from iscat_analysis.day.jobs import write_whole
 from iscat_analysis.day.table import Plan
 from iscat_analysis.files import whole_file
-from iscat_analysis.report.batch import batch_page, summary_line
-from iscat_analysis.report.batch_figures import Curve
+from iscat_analysis.report.batch import BatchContents, Curve, batch_page, summary_line
 from iscat_analysis.report.output import atomic_folder
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.text import in_table
@@ -105,9 +104,7 @@ def _page(
     )
     shown.attrs["further"] = list(movies.columns[len(MOVIE_COLUMNS) :])
     scales = {each.summary["mass_scale"] for each in found if each.summary}
-    return batch_page(
-        plan.table.title,
-        subtitle=summary_line(movies),
+    contents = BatchContents(
         curves=[_curve(each, groups[each.movie.name]) for each in found],
         movies=shown,
         species=species.assign(group=[groups[name] for name in species["movie"]]),
@@ -120,8 +117,8 @@ def _page(
         calibrations=_calibrations(day),
         failed=[*failed, *((kd_name(each.condition), each.why) for each in series if each.why)],
         mass_label="mass [kDa]" if scales <= {"calibration"} else "mass, model scale [kDa]",
-        folder=folder,
     )
+    return batch_page(plan.table.title, summary_line(movies), contents, folder)
 
 
 def _calibrations(day: Day) -> list[tuple[str, str, str]]:

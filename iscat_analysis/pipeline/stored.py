@@ -18,7 +18,7 @@ from iscat_analysis.pipeline.redraw import Redraw, redraw
 from iscat_analysis.reading import read_json, read_parquet
 from iscat_analysis.records import EventView, tally
 from iscat_analysis.report.answer import answer_in
-from iscat_analysis.report.pictures import draw_view, event_facts
+from iscat_analysis.report.figures import draw_view, event_facts
 
 
 def open_result(folder: str | Path, *, movie: str | Path | None = None) -> StoredResult:

@@ -1,26 +1,26 @@
 """The last stage: an `Analysis` becomes a folder of tables, figures and one self-contained page.
 
-``tables`` writes what programs read, ``figures`` what papers print, ``page`` what people open.
-``drawing`` makes both of the latter, and ``output`` makes the folder appear whole or not at all.
-The page templates are shared: anything that wants to look like the report calls `render_page`, most
-easily with ``document.html``.
+``tables`` writes what programs read, ``answer`` says in a few words what was found, ``movie_page``
+and its figures are what people open, and ``output`` makes the folder appear whole or not at all.
+The other modules are a page each: of a batch, of bounds, of a calibration, of a benchmark.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from markupsafe import Markup
+
 from iscat_analysis.executors import Executor, LocalExecutor
-from iscat_analysis.records import Analysis
-from iscat_analysis.report.drawing import draw
+from iscat_analysis.records import Analysis, Progress, silent
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output
-from iscat_analysis.report.posterior import write_posterior
-from iscat_analysis.report.tables import write_tables
+from iscat_analysis.report.tables import event_table, write_posterior, write_tables
 
 if TYPE_CHECKING:
+    from iscat_analysis.report.movie_page import render_report as render_report
     from iscat_analysis.report.page import render_page as render_page
-    from iscat_analysis.report.page import render_report as render_report
 
 EVENT_FIGURES = 12
 """Events whose images are drawn into the folder, at most."""
@@ -30,20 +30,22 @@ __all__ = [
     "OUTPUT_NAMES",
     "atomic_folder",
     "check_output",
+    "draw_part",
     "fill_report",
     "render_page",
     "render_report",
     "write_report",
 ]
 
+_PAGES = {"render_page": "page", "render_report": "movie_page"}
+_HERE, _ELSEWHERE = 0, 1
+
 
 def __getattr__(name: str) -> Any:
     """Import pages where they are asked for: Matplotlib is a quarter of all that a fit imports."""
-    if name not in ("render_page", "render_report"):
+    if name not in _PAGES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from iscat_analysis.report import page
-
-    return getattr(page, name)
+    return getattr(import_module(f"{__name__}.{_PAGES[name]}"), name)
 
 
 def write_report(
@@ -69,11 +71,39 @@ def write_report(
 def fill_report(
     analysis: Analysis, folder: Path, *, event_figures: int, executor: Executor | None = None
 ) -> None:
-    """Write a report into a folder of its own."""
+    """Write a report into a folder of its own; two processes draw it where there is a second one.
+
+    Matplotlib takes long to load.  The second process has loaded it by now; this one loads it while
+    the second one draws.
+    """
     pictures = folder / "figures"
     pictures.mkdir(exist_ok=True)
     write_tables(analysis, folder)
     write_posterior(analysis, folder / "posterior.nc")
-    nearby = LocalExecutor() if executor is None or executor.distant else executor  # it writes here
-    page = draw(analysis, pictures, event_figures, nearby)
+    place = LocalExecutor() if executor is None or executor.distant else executor  # it writes here
+    parts = place.each(
+        lambda part: place.call(draw_part, analysis, pictures, event_figures, part),
+        (_HERE, _ELSEWHERE),
+    )
+    _, figures = next(parts)
+
+    from iscat_analysis.report.movie_page import page_context, page_of, page_sketches
+
+    table = event_table(analysis)
+    about = page_context(analysis, table, pictures)
+    for _, some in parts:
+        figures |= some
+    shown = [name for name, _ in page_sketches(analysis, table)]
+    page = page_of(about, {name: figures[name] for name in shown if name in figures})
     (folder / "report.html").write_text(page, encoding="utf-8")
+
+
+def draw_part(
+    analysis: Analysis, folder: Path, most: int, part: int, *, progress: Progress = silent
+) -> dict[str, Markup]:
+    """Draw a part of the figures into a folder, images of `most` events among them."""
+    from iscat_analysis.report.movie_page import publish_figures
+
+    del progress
+    # one figure of three is drawn here, beside Matplotlib's loading and the page's text
+    return publish_figures(analysis, folder, most, lambda n: (n % 3 == 0) == (part == _HERE))

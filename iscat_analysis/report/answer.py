@@ -1,15 +1,17 @@
-"""What a table of events or tracks says in one line: for the page, stdout, a notebook and a batch.
+"""What an analysis says in a few words: the same on the page, on stdout, in a notebook and a batch.
 
 Where species were found, they are the answer: of several there is no median.  Where events are too
 few for species and are not alike, their range is.  Otherwise the median of the main quantity is,
-over the rows whose status is ok.  Where more than a fifth of the rows is
-flagged, the rest is a selection rather than a sample, and there is no answer.
+over the rows whose status is ok.  Where more than a fifth of the rows is flagged, the rest is a
+selection rather than a sample, and there is no answer.  Without a calibration the main quantity is
+the contrast, because the model's absolute scale is not a mass.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,49 +20,136 @@ import numpy as np
 import pandas as pd
 from scipy.special import chdtrc
 
+from iscat_analysis.config import MODES, SCHEMES
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.results import (
+    MANY_FLAGGED,
+    MODEL_REJECTED,
+    NO_TRACK,
+    NOT_A_MASS,
+    NOTHING_FOUND,
+)
 from iscat_analysis.reading import read_json, read_parquet
 from iscat_analysis.records import (
-    FREE_PARAMETERS,
+    POOR_P,
     TRACK_COLUMNS,
     Analysis,
     FloatArray,
     Status,
     TrackStatus,
+    counted,
+    is_rejected,
     tally,
 )
-from iscat_analysis.report.numbers import number
+from iscat_analysis.report.numbers import (
+    LABELS,
+    UNITS,
+    Fact,
+    decimals_for,
+    fixed,
+    number,
+    percent,
+    sentence,
+)
+from iscat_analysis.units import count
 
 MOST_FLAGGED = 0.2
 """Share of flagged rows above which no answer is given."""
 
-_BETWEEN = " · "  # species
-_WIDTH = 0.1  # of a species, over its mass
-_UNLIKE = 1e-3  # p-value below which events are of more than one species
+TRACK_HEADINGS: Mapping[str, tuple[str, str, str]] = {
+    "mass": ("mass_kda", "sigma_mass_kda", "kDa"),
+    "D": ("d_um2_s", "sigma_d_um2_s", "µm²/s"),
+    "optical diameter": ("optical_diameter_nm", "sigma_optical_diameter_nm", "nm"),
+    "diameter": ("diameter_nm", "sigma_diameter_nm", "nm"),
+    "index": ("refractive_index", "sigma_refractive_index", ""),
+}
+"""Columns of the short table of tracks, with their errors and units."""
+
+
+# ---- What the rows are, and their main quantity --------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RowKind:
+    """What the rows of a table of results are: events, or tracks.
+
+    Attributes
+    ----------
+    noun, judged : str
+        What one is called, and those of which a fair sample is asked.
+    status : type
+        Verdicts on them.
+    begins, heading : str
+        Column of the first frame, and its heading.
+    short : str
+        Verdict on rows that are too short to be judged; empty if there is none.
+    """
+
+    noun: str
+    judged: str
+    status: type[Status] | type[TrackStatus]
+    begins: str
+    heading: str
+    short: str = ""
+
+
+EVENTS_KIND = RowKind("event", "events", Status, "frame", "frame")
+TRACKS_KIND = RowKind(
+    "track", "that are long enough", TrackStatus, "first_frame", "from frame",
+    TrackStatus.FEW_FRAMES.value,
+)  # fmt: skip
+
+
+def row_kind(analysis: Analysis) -> RowKind:
+    """Tell whether an analysis is of events or of tracks."""
+    return EVENTS_KIND if analysis.tracks is None else TRACKS_KIND
+
+
+def tracks_of(analysis: Analysis) -> pd.DataFrame:
+    """Give the tracks of an analysis."""
+    found = analysis.tracks
+    return pd.DataFrame(columns=list(TRACK_COLUMNS)) if found is None else found
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """The main quantity of an analysis: a column, its name and unit."""
+    """The main quantity of an analysis: a column, its name and unit.
+
+    `power` is that of the mass to which a signal without a scale of masses is proportional.
+    """
 
     column: str
     label: str
-    unit: str
-
-
-@dataclass(frozen=True)
-class Answer:
-    """One number, or those of all species, with its name and unit."""
-
-    label: str
-    value: str
-    unit: str
-    note: str = ""
+    unit: str = ""
+    power: int = 0
 
     @property
-    def text(self) -> str:
-        """Everything in a line."""
-        value = f"{self.label} {self.value} {self.unit}".rstrip()
-        return f"{value}, {self.note}" if self.note else value
+    def axis(self) -> str:
+        """Label of an axis."""
+        return f"{self.label} [{self.unit}]" if self.unit else self.label
+
+    def values(self, table: pd.DataFrame) -> tuple[FloatArray, FloatArray]:
+        """Give the quantity of every row, and its σ, on its scale if it has none of its own."""
+        values = table[self.column].to_numpy(float)
+        sigma = table.get(f"sigma_{self.column}")
+        if sigma is not None:
+            return values, sigma.to_numpy(float)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            scale = np.abs(values / table["mass_kda"].to_numpy(float))
+            return values, table["sigma_mass_kda"].to_numpy(float) * scale
+
+
+HEIGHT = Quantity("z_nm", "height", "nm")
+DIAMETER = Quantity("diameter_nm", "diameter", "nm")
+MASS = Quantity("mass_kda", "mass", "kDa")
+PHOTONS = Quantity("n_scattered", "number of scattered photons", power=2)
+CONTRAST = Quantity("contrast", "contrast", power=1)
+_OF_TRACKS = (
+    Quantity("optical_diameter_nm", "optical diameter", "nm"),
+    Quantity("d_um2_s", "D", "µm²/s"),
+    Quantity("diameter_nm", "hydrodynamic diameter", "nm"),
+    Quantity("refractive_index", "refractive index"),
+)
 
 
 def is_uncalibrated(analysis: Analysis) -> bool:
@@ -73,38 +162,74 @@ def main_quantity(analysis: Analysis) -> Quantity:
     return _quantity(analysis.mode, analysis.scheme, analysis.summary)
 
 
+def track_quantity(analysis: Analysis) -> Quantity:
+    """Choose between contrast and mass of tracks, with the scale in the name of a mass."""
+    main = main_quantity(analysis)
+    if main is CONTRAST:
+        return Quantity("contrast", "|contrast|", power=1)
+    return MASS if main is MASS else Quantity("mass_kda", "mass, model scale", "kDa")
+
+
 def _has_no_scale(mode: str, summary: Mapping[str, Any]) -> bool:
     known = summary.get("mass_scale") in ("calibration", "volume and density")
-    return "mass_kda" in FREE_PARAMETERS[mode] and not known
+    return MODES[mode].masses_free and not known
 
 
 def _quantity(mode: str, scheme: str, summary: Mapping[str, Any]) -> Quantity:
     """Choose the main quantity; without a calibration the model's absolute scale is not a mass."""
-    if "mass_kda" not in FREE_PARAMETERS[mode]:
-        return Quantity("z_nm", "height", "nm")
-    if mode == "size":
-        return Quantity("diameter_nm", "diameter", "nm")
+    kind = MODES[mode]
+    if not kind.masses_free:
+        return HEIGHT
+    if kind.fits_sizes:
+        return DIAMETER
     if not _has_no_scale(mode, summary):
-        return Quantity("mass_kda", "mass", "kDa")
-    if scheme == "darkfield":
-        return Quantity("n_scattered", "number of scattered photons", "")
-    return Quantity("contrast", "contrast", "")
+        return MASS
+    return CONTRAST if scheme not in SCHEMES or SCHEMES[scheme].interferes else PHOTONS
 
 
-def answers(
-    analysis: Analysis, table: pd.DataFrame, tracks: pd.DataFrame | None = None
-) -> tuple[Answer, ...]:
+def main_parameter(analysis: Analysis) -> str:
+    """Name the parameter whose precision is the headline's: the mass, or else the height."""
+    return "mass_kda" if analysis.mode_kind.masses_free else "z_nm"
+
+
+def label_of(analysis: Analysis, name: str) -> str:
+    """Name a parameter in tables and figures."""
+    return "mass, model scale" if name == "mass_kda" and is_uncalibrated(analysis) else LABELS[name]
+
+
+def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
+    """Convert masses to contrasts, for a scale that is proportional to the mass."""
+    per_kda = (table["contrast"] / table["mass_kda"]).abs()
+    columns = [name for kind in ("sigma", "crb", "qcrb") if (name := f"{kind}_mass_kda") in table]
+    scaled = {name: table[name] * per_kda for name in columns}
+    if "systematic_contrast" in table:
+        scaled["systematic_mass_kda"] = table["systematic_contrast"]
+    return table.assign(**scaled, mass_kda=table["contrast"])
+
+
+def as_diameters(table: pd.DataFrame) -> pd.DataFrame:
+    """Put the diameters of spheres in the place of their masses."""
+    kinds = ("sigma", "crb", "qcrb", "systematic")
+    names = [name for kind in kinds if (name := f"{kind}_mass_kda") in table]
+    sizes = {name: table[name.replace("mass_kda", "diameter_nm")] for name in names}
+    return table.assign(**sizes, mass_kda=table["diameter_nm"])
+
+
+# ---- Answers -------------------------------------------------------------------------------------
+
+
+def answers(analysis: Analysis, table: pd.DataFrame) -> tuple[Fact, ...]:
     """Answer for the events of an analysis, or for its tracks; nothing where no answer is fair."""
     main = main_quantity(analysis)
-    if tracks is None:
+    if analysis.tracks is None:
         return _of_events(main, analysis.summary, table)
-    return _of_tracks(main, analysis.summary, tracks)
+    return _of_tracks(main, analysis.summary, analysis.tracks)
 
 
 def answer_in(folder: Path) -> str:
     """Give the answer of a result folder; empty where there is none."""
     summary = read_json(folder / "summary.json")
-    if summary.get("mode") not in FREE_PARAMETERS:  # of another version
+    if summary.get("mode") not in MODES:  # of another version
         return ""
     main = _quantity(summary["mode"], summary.get("scheme", ""), summary)
     if (folder / "tracks.parquet").is_file():
@@ -114,34 +239,39 @@ def answer_in(folder: Path) -> str:
     return "; ".join(each.text for each in found)
 
 
-def _of_events(
-    main: Quantity, summary: Mapping[str, Any], table: pd.DataFrame
-) -> tuple[Answer, ...]:
-    values = sizes(main, table)
+def _of_events(main: Quantity, summary: Mapping[str, Any], table: pd.DataFrame) -> tuple[Fact, ...]:
+    values = np.abs(_good(table)[main.column].to_numpy(float))
+    values = values[np.isfinite(values)]
     if not values.size or caution(table) is not None:
         return ()
     if several := _species(main, summary, table):
         return (several,)
-    low, middle, high = quantiles(values)
+    low, middle, high = quartiles(values)
     if (summary.get("distribution") or {}).get("species") == [] and _differ(table):
         value = f"{number(values.min())} to {number(values.max())}"
         note = "in events that are not alike and too few to tell species"
-        return (Answer(main.label.capitalize(), value, main.unit, note),)
+        return (Fact(main.label.capitalize(), value, main.unit, note),)
     if values.size == 1:
-        return (Answer(main.label.capitalize(), number(middle), main.unit),)
+        return (Fact(main.label.capitalize(), number(middle), main.unit),)
     note = f"middle half {number(low)} to {number(high)} {main.unit}".rstrip()
-    return (Answer(f"Median {main.label}", number(middle), main.unit, note),)
+    return (Fact(f"Median {main.label}", number(middle), main.unit, note),)
+
+
+def _good(table: pd.DataFrame) -> pd.DataFrame:
+    """Give the events, or tracks, whose status is ok."""
+    return table[table["status"] == Status.OK.value]
 
 
 def _differ(table: pd.DataFrame) -> bool:
     """Tell whether masses differ by more than their errors and what one species may be wide."""
-    rows = table[table["status"] == Status.OK.value]
+    rows = _good(table)
     mass, sigma = rows["mass_kda"].abs().to_numpy(), rows["sigma_mass_kda"].to_numpy()
-    off = (mass - np.median(mass)) / np.hypot(sigma, _WIDTH * np.median(mass))
-    return float(chdtrc(max(mass.size - 1, 1), float(np.nansum(off**2)))) < _UNLIKE
+    width = 0.1 * np.median(mass)
+    off = (mass - np.median(mass)) / np.hypot(sigma, width)
+    return float(chdtrc(max(mass.size - 1, 1), float(np.nansum(off**2)))) < 1e-3
 
 
-def _species(main: Quantity, summary: Mapping[str, Any], table: pd.DataFrame) -> Answer | None:
+def _species(main: Quantity, summary: Mapping[str, Any], table: pd.DataFrame) -> Fact | None:
     """List the species, if there are several, on the scale of the main quantity."""
     populations = (summary.get("sizes") or {}).get("populations", ())
     described = (summary.get("distribution") or {}).get("species", ())
@@ -150,80 +280,33 @@ def _species(main: Quantity, summary: Mapping[str, Any], table: pd.DataFrame) ->
     values = np.array([each[column] for each in known], dtype=float)
     if len(values) < 2:
         return None
-    if main.column in ("contrast", "n_scattered"):  # what is proportional to the mass or its square
-        rows, power = table[table["status"] == Status.OK.value], 1 + (main.column == "n_scattered")
-        per = (rows[main.column] / rows["mass_kda"] ** power).abs().to_numpy(float)
-        values = quantiles(per)[1] * values**power
+    if main.power:
+        rows = _good(table)
+        per = (rows[main.column] / rows["mass_kda"] ** main.power).abs().to_numpy(float)
+        values = quartiles(per)[1] * values**main.power
     named = "Diameters" if populations else f"Species of {main.label}"
     unit = "nm" if populations else main.unit
-    return Answer(named, _BETWEEN.join(map(number, values.tolist())), unit)
+    return Fact(named, " · ".join(map(number, values.tolist())), unit)
 
 
 def _of_tracks(
     main: Quantity, summary: Mapping[str, Any], tracks: pd.DataFrame
-) -> tuple[Answer, ...]:
-    if tracks.empty or tracks_caution(tracks) is not None:
+) -> tuple[Fact, ...]:
+    if tracks.empty or caution(tracks, TRACKS_KIND) is not None:
         return ()
-    good = tracks[tracks["status"] == TrackStatus.OK.value]
-    size = main if main.column == "contrast" else Quantity("mass_kda", "mass", "kDa")
-    named = (
-        size,
-        Quantity("optical_diameter_nm", "optical diameter", "nm"),
-        Quantity("d_um2_s", "D", "µm²/s"),
-        Quantity("diameter_nm", "hydrodynamic diameter", "nm"),
-        Quantity("refractive_index", "refractive index", ""),
-    )
-    several = _species(Quantity("diameter_nm", "", "nm"), {"sizes": summary.get("sizes")}, good)
+    good = _good(tracks)
+    several = _species(DIAMETER, {"sizes": summary.get("sizes")}, good)
     found = []
-    for each in named:
+    for each in (main if main is CONTRAST else MASS, *_OF_TRACKS):
         value = float(good[each.column].median()) if each.column in good else math.nan
         if each.column == "optical_diameter_nm" and several:
             found.append(several)
-        elif math.isfinite(value) and not (several and each is size):
-            found.append(Answer(f"Median {each.label}", number(value), each.unit))
+        elif math.isfinite(value) and not (several and each in (CONTRAST, MASS)):
+            found.append(Fact(f"Median {each.label}", number(value), each.unit))
     return tuple(found)
 
 
-def caution(table: pd.DataFrame) -> str | None:
-    """Say that too many events are flagged for an answer."""
-    rows = tally(table)
-    if rows.flagged <= MOST_FLAGGED * rows.number:
-        return None
-    commonest = Status(next(name for name in rows.status if name != Status.OK.value))
-    which = f"{rows.flagged} of {rows.number} events are"
-    if rows.number == 1:
-        which = "The only event is"
-    rest = ": the rest is no fair sample" if rows.ok else ""
-    return (
-        f"{which} flagged, so no median is given{rest}. The commonest reason is "
-        f"{commonest.value}. {commonest.advice}"
-    )
-
-
-def tracks_caution(tracks: pd.DataFrame) -> str | None:
-    """Say that too many tracks are flagged for a median."""
-    rows = tally(tracks[tracks["status"] != TrackStatus.FEW_FRAMES.value])  # these have no D
-    if rows.flagged <= MOST_FLAGGED * rows.number:
-        return None
-    commonest = TrackStatus(next(name for name in rows.status if name != TrackStatus.OK.value))
-    return (
-        f"{rows.flagged} of {rows.number} that are long enough are flagged, so no median is given"
-        f"{': the rest is no fair sample' if rows.ok else ''}. The commonest "
-        f"reason is {commonest.value}. {commonest.advice}"
-    )
-
-
-def sizes(main: Quantity, table: pd.DataFrame) -> FloatArray:
-    """Give the magnitudes of the main quantity over the rows that are ok.
-
-    Shapes: result (n,).
-    """
-    good = table["status"] == Status.OK.value
-    values = np.abs(table[main.column][good].to_numpy(float))
-    return np.asarray(values[np.isfinite(values)])
-
-
-def quantiles(values: FloatArray) -> tuple[float, float, float]:
+def quartiles(values: FloatArray) -> tuple[float, float, float]:
     """Give the quartiles of what is finite."""
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -232,7 +315,242 @@ def quantiles(values: FloatArray) -> tuple[float, float, float]:
     return float(low), float(middle), float(high)
 
 
-def tracks_of(analysis: Analysis) -> pd.DataFrame:
-    """Give the tracks of an analysis."""
-    found = analysis.tracks
-    return pd.DataFrame(columns=list(TRACK_COLUMNS)) if found is None else found
+# ---- Precision -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Precision:
+    """σ of one parameter and its bounds, over the rows that are ok."""
+
+    name: str
+    events: int
+    sigma: float
+    crb: float
+    qcrb: float
+    holevo: float
+    over_crb: float
+    information: float
+    systematic: float
+    measured: float
+    measured_ci95: tuple[float, float]
+    whole: bool
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the spread was measured."""
+        return math.isfinite(self.measured)
+
+    @property
+    def measured_text(self) -> str:
+        """The measured spread over the bound with its interval."""
+        low, high = self.measured_ci95
+        return f"{fixed(self.measured, 2)} ({fixed(low, 2)} to {fixed(high, 2)})"
+
+    @property
+    def shared(self) -> str:
+        """The error that all events share, as text; empty where it is not known."""
+        known = math.isfinite(self.systematic)
+        return f", common to all events {number(self.systematic)}" if known else ""
+
+
+def precision_of(analysis: Analysis, table: pd.DataFrame, name: str) -> Precision:
+    """Set σ of one parameter beside its bounds."""
+    good = _good(table)
+    sigma, crb, qcrb = (good[f"{kind}_{name}"].to_numpy(float) for kind in ("sigma", "crb", "qcrb"))
+    usable = np.isfinite(sigma) & np.isfinite(crb) & (crb > 0)
+    sigma, crb, qcrb = sigma[usable], crb[usable], qcrb[usable]
+    medians = analysis.summary.get("precision", {}).get(name, {})
+    holevo, measured = medians.get("holevo_median"), medians.get("repeat_over_crb")
+    known = measured is not None
+    shared = good.get(f"systematic_{name}", pd.Series(dtype=float)).to_numpy(float)
+    return Precision(
+        name=name,
+        events=int(usable.sum()),
+        sigma=quartiles(sigma)[1],
+        crb=quartiles(crb)[1],
+        qcrb=quartiles(qcrb)[1],
+        holevo=math.nan if holevo is None else holevo,
+        over_crb=quartiles(sigma / crb)[1],
+        information=quartiles((qcrb / crb) ** 2)[1]
+        if holevo is None
+        else medians["information_fraction_median"],
+        systematic=quartiles(shared)[1],
+        measured=measured if known else math.nan,
+        measured_ci95=tuple(medians["repeat_over_crb_ci95"]) if known else (math.nan, math.nan),
+        whole=known and medians["repeat_whole"],
+    )
+
+
+# ---- Sentences -----------------------------------------------------------------------------------
+
+
+def caution(table: pd.DataFrame, kind: RowKind = EVENTS_KIND) -> Finding | None:
+    """Find that too many events, or tracks, are flagged for an answer."""
+    rows = tally(table[table["status"] != kind.short])
+    if rows.flagged <= MOST_FLAGGED * rows.number:
+        return None
+    commonest = kind.status(next(name for name in rows.status if name != Status.OK.value))
+    which = f"{rows.flagged} of {rows.number} {kind.judged} are"
+    return MANY_FLAGGED(
+        {
+            "rows": f"The only {kind.noun} is" if rows.number == 1 else which,
+            "rest": ": the rest is no fair sample" if rows.ok else "",
+            "reason": commonest.value,
+            "advice": commonest.advice.rstrip("."),
+        }
+    )
+
+
+def rejection(table: pd.DataFrame) -> Finding | None:
+    """Find that the model of the image is rejected."""
+    if not is_rejected(table):
+        return None
+    p_values = counted(table)["p_value"].dropna()
+    return MODEL_REJECTED(
+        {
+            "poor": int((p_values < POOR_P).sum()),
+            "fits": p_values.size,
+            "level": POOR_P,
+            "chance": number(POOR_P * p_values.size, 2),
+        }
+    )
+
+
+def not_a_mass(analysis: Analysis) -> list[str]:
+    """Say that masses are on the model's own scale, where they are."""
+    return [sentence(NOT_A_MASS().text)] if is_uncalibrated(analysis) else []
+
+
+def headline(analysis: Analysis, table: pd.DataFrame) -> list[str]:
+    """Summarise the result in two or three sentences; `table` has the events, or all positions."""
+    kind, tracks = row_kind(analysis), tracks_of(analysis)
+    found = counted(table)
+    if found.empty:
+        return [sentence(NOTHING_FOUND().text)]
+    positions = count(len(table), "fitted position")
+    if kind is TRACKS_KIND and tracks.empty:
+        return [sentence(NO_TRACK({"positions": positions}).text)]
+    lines = [*spread_lines(analysis, found), *not_a_mass(analysis)]
+    judged = found if kind is EVENTS_KIND else tracks
+    rows, flagged = tally(judged), caution(judged, kind)
+    said = [fact.text for fact in answers(analysis, found)] if flagged is None else []
+    ok = f"{rows.ok if rows.flagged else 'all'} of them ok."
+    if kind is TRACKS_KIND:
+        text = f"{count(rows.number, 'track')} of {positions}, {ok}"
+        if flagged is not None:
+            text += f" {sentence(flagged.text)}"
+        elif said:
+            text += f" Over tracks: {', '.join(each[:1].lower() + each[1:] for each in said)}."
+        return [text, *lines]
+    if flagged is not None:
+        return [sentence(flagged.text), *lines]
+    text = f"{count(rows.number, 'event')}, {ok}"
+    text = (
+        "One event, and it is ok."
+        if rows.number == 1
+        else " ".join([text, *(f"{t}." for t in said)])
+    )
+    return [text, *_against_bounds(analysis, found), *lines]
+
+
+def _against_bounds(analysis: Analysis, table: pd.DataFrame) -> list[str]:
+    """Compare σ of the mass, or else of the height, with the bounds."""
+    name = main_parameter(analysis)
+    p = precision_of(analysis, table, name)
+    if not p.events:
+        return []
+    of_it, sigma = LABELS[name], f"{number(p.sigma)} {UNITS[name]}"
+    shared = f"{number(p.systematic)} {UNITS[name]}" if math.isfinite(p.systematic) else ""
+    if is_uncalibrated(analysis):
+        good = _good(table)
+        of_it = "contrast"
+        relative = (good["sigma_mass_kda"] / good["mass_kda"].abs()).to_numpy(float)
+        sigma = f"{percent(quartiles(relative)[1])} of it"
+        if "systematic_contrast" in good:
+            relative = (good["systematic_contrast"] / good["contrast"].abs()).to_numpy(float)
+            shared = f"{percent(quartiles(relative)[1])} of it"
+    text = f"σ of the {of_it}, from the curvature of the likelihood, is {sigma}"
+    text += f", {number(p.over_crb)} times the Cramér–Rao bound"
+    if shared:
+        text += f"; the error common to all events is {shared}"
+    if math.isfinite(p.information):
+        of = "can be had of the light" if math.isfinite(p.holevo) else "is in the light"
+        text += f"; {percent(p.information)} of the information that {of} is used"
+    return [f"{text}."]
+
+
+def spread_lines(analysis: Analysis, table: pd.DataFrame) -> list[str]:
+    """Describe the measured spread, and whether the model is rejected."""
+    message = analysis.summary.get("repeats", {}).get("message", "")
+    name, lines = main_parameter(analysis), []
+    p = precision_of(analysis, table, name)
+    if message:
+        lines.append(
+            f"{message if message.startswith('σ') else message[:1].upper() + message[1:]}."
+        )
+    elif p.is_measured:
+        where = "between parts of each event's frames; slower noise does not show there"
+        if p.whole:
+            where = (
+                "between parts of each event's frames and, at full length, where there is no "
+                "particle"
+            )
+        if analysis.mode_kind.follows_tracks:
+            where = "of single frames where there is no particle"
+        of_it = "contrast" if is_uncalibrated(analysis) else LABELS[name]
+        lines.append(
+            f"The measured spread of the {of_it}, {where}, is {p.measured_text} times the "
+            "Cramér–Rao bound."
+        )
+    if (rejected := rejection(table)) is not None:
+        lines += [sentence(rejected.text), *species_widths(analysis.summary)]
+    return lines
+
+
+def species_widths(summary: Mapping[str, Any]) -> list[str]:
+    """Say how much wider than σ the species are."""
+    lines = []
+    calibrated = summary.get("mass_scale") == "calibration"
+    for one in summary.get("across_particles") or ():
+        values = [one[f"width_{key}"] for key in ("kda", "low", "high")]
+        if not all(value is not None and math.isfinite(value) for value in values):
+            continue
+        scale, unit, name = 1.0, " kDa", f"at {number(one['mass_kda'])} kDa"
+        if not calibrated:
+            scale, unit, name = 100 / one["mass_kda"], " %", "of contrast"
+        decimals = decimals_for([scale * (values[2] - values[1]) / 2])
+        width, low, high = (fixed(scale * value, decimals) for value in values)
+        budget = ""
+        if (explained := one.get("explained_kda")) is not None:
+            budget = f" The budget explains {fixed(scale * explained, decimals)}{unit} of that."
+        lines.append(
+            f"Across particles: beyond the σ of its {one['count']:.0f} events the species {name} "
+            f"is {width}{unit} ({low} to {high}) wide, so that its events scatter by "
+            f"{number(one['spread_over_sigma'])} times σ.{budget}"
+        )
+    return lines
+
+
+def track_lines(summary: Mapping[str, Any]) -> Iterator[str]:
+    """Describe where tracks begin, end and meet."""
+    motion = summary.get("motion")
+    if not motion or not summary.get("tracks"):
+        return
+    if motion["cross_border"]:
+        yield (
+            f"{motion['cross_border']} of {count(summary['tracks'], 'track')} begin or end at the "
+            "border of the field; a particle that leaves and comes back is another track."
+        )
+    if motion["end_inside"] + motion["begin_inside"]:
+        yield (
+            f"{motion['begin_inside']} begin and {motion['end_inside']} end inside the field: "
+            "particles come from the liquid and go there, meet others, or are lost from sight."
+        )
+
+
+def advice(tracks: pd.DataFrame) -> Iterator[str]:
+    """Explain the flags of tracks."""
+    flag_counts = Counter(flag for flags in tracks["flags"] for flag in str(flags).split(";"))
+    for status in TrackStatus:
+        if flag_counts[status.value]:
+            yield f"{count(flag_counts[status.value], 'track')} {status}: {status.advice}"

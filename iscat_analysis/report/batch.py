@@ -1,4 +1,4 @@
-"""The page of a batch: what many movies say, side by side.
+"""The page of a batch: what many movies say, side by side, on common axes and in the size of print.
 
 Everything arrives as the tables that are written beside it; nothing is computed here.
 """
@@ -7,36 +7,61 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
+import numpy as np
 import pandas as pd
 from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
-from iscat_analysis.report.batch_cells import (
+from iscat_analysis.records import FloatArray
+from iscat_analysis.report.numbers import (
+    Column,
+    Fact,
+    Table,
+    fixed,
+    intervals,
     link,
+    number,
+    numeric,
+    of,
     percent,
     plain,
     probability,
-    share,
+    tabulate,
     unbroken,
-    whole,
-    with_interval,
+    worded,
 )
-from iscat_analysis.report.batch_figures import Curve, batch_figures
-from iscat_analysis.report.binding import binding_figure
-from iscat_analysis.report.numbers import fixed, number
-from iscat_analysis.report.page import render_page
-from iscat_analysis.report.style import publish
+from iscat_analysis.report.page import Chart, Section, render_document
+from iscat_analysis.report.species import binding_figure
+from iscat_analysis.report.style import (
+    BLUE,
+    GREY,
+    GRID,
+    INK,
+    PURPLE,
+    VERMILLION,
+    new_figure,
+    plain_log,
+    publish,
+    whiskers,
+)
 from iscat_analysis.schemas import jsonable
+from iscat_analysis.text import in_figure
 from iscat_analysis.units import count
 
 LONG = 30
-"""Rows above which a table scrolls, and can be narrowed."""
+"""Rows above which a table scrolls, and can be narrowed; and samples in one figure of stacked
+distributions."""
 
 _SHARE = "of the particles that came, corrected for those that were missed; without outliers"
+_HOLM = "corrected for the number of comparisons"
 
 _CHARTS = {
     "overlaid": (
@@ -63,357 +88,513 @@ _CHARTS = {
     ),
     "rates": ("Landing rate", "With 95 % Poisson intervals; not corrected for what was missed."),
 }
+_WIDTH = 7.2  # inches: two columns of a journal
+_COLORS = (BLUE, VERMILLION, "#009E73", PURPLE, "#56B4E9", "#E69F00", GREY)
+_NAMED = 8  # entries of a legend
 
 
-def batch_page(
-    title: str,
-    *,
-    subtitle: str,
-    curves: Sequence[Curve],
-    movies: pd.DataFrame,
-    species: pd.DataFrame,
-    shifts: pd.DataFrame,
-    equilibria: Sequence[tuple[str, Mapping[str, Any], Sequence[str]]] = (),
-    calibrations: Sequence[tuple[str, str, str]],
-    failed: Sequence[tuple[str, str]],
-    mass_label: str,
-    folder: Path | None = None,
-) -> str:
-    """Make the page of a batch, and write its figures."""
-    figures = chain(
-        batch_figures(curves, movies, species, mass_label=mass_label), _binding(equilibria)
-    )
-    drawn = publish(figures, folder, printed=True)
-    sections = [
-        _overview(movies, failed, calibrations),
-        _charts("masses", "Masses", drawn, ("overlaid", "stacked")),
-        _species(species, shifts, drawn, mass_label, movies),
-        _equilibria(equilibria, drawn),
-        _landing(movies, drawn),
-        _quality(movies),
-    ]
-    return render_page(
-        "document.html",
-        {
-            "title": title,
-            "subtitle": subtitle,
-            "sections": [section for section in sections if section is not None],
-        },
-    )
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Masses of one movie."""
+
+    movie: str
+    sample: str
+    group: str
+    masses_kda: FloatArray
+    grid_kda: FloatArray
+    density: FloatArray
 
 
-def _overview(
-    movies: pd.DataFrame,
-    failed: Sequence[tuple[str, str]],
-    calibrations: Sequence[tuple[str, str, str]],
-) -> dict[str, Any]:
-    done = movies[movies["state"] == "done"]
-    analysed = done[done["role"] != "flat"]
-    cautioned = int((done["cautions"].fillna("") != "").sum())
-    tables = []
-    if failed:
-        columns: list[Any] = ["not analysed", "why"]
-        tables.append({"columns": columns, "rows": [list(each) for each in failed]})
-    rows = [[link(page, what), source] for what, source, page in calibrations]
-    tables.append({"columns": ["calibration", "from"], "rows": rows})
-    return {
-        "id": "day",
-        "title": "The day",
-        "facts": [
-            {
-                "label": "Movies",
-                "value": str(len(done)),
-                "note": f"of {len(movies)}" if len(done) < len(movies) else "all of the table",
-            },
-            {"label": "Samples", "value": str(analysed["sample"].nunique())},
-            {"label": "Events", "value": str(int(analysed["events"].sum()))},
-            {"label": "With cautions", "value": str(cautioned), "note": "see the quality"},
-        ],
-        "tables": tables,
-    }
+@dataclass(frozen=True, eq=False)
+class BatchContents:
+    """The tables of a batch, as its page shows them.
 
+    Attributes
+    ----------
+    movies, species, shifts : DataFrame
+        As they are written, with the panel of each row in a column ``group``.
+    curves : sequence of Curve
+        Masses of all movies.
+    equilibria : sequence of (str, mapping, sequence of str)
+        Condition, document ``kd`` and remarks of each series.
+    calibrations : sequence of (str, str, str)
+        What was calibrated, by what, and its page.
+    failed : sequence of (str, str)
+        What was not analysed, and why.
+    mass_label : str
+        Heading of masses.
+    """
 
-def _charts(
-    name: str, title: str, drawn: Mapping[str, Markup], kinds: Sequence[str]
-) -> dict[str, Any] | None:
-    charts = []
-    for figure, svg in drawn.items():
-        kind, _, number_of = figure.partition("_")
-        if kind in kinds:
-            heading, caption = _CHARTS[kind]
-            charts.append(
-                {
-                    "id": f"figure-{figure.replace('_', '-')}",
-                    "title": f"{heading}, {number_of}" if number_of else heading,
-                    "caption": caption if not number_of else None,
-                    "svg": svg,
-                    "wide": True,
-                }
-            )
-    return {"id": name, "title": title, "charts": charts} if charts else None
+    movies: pd.DataFrame
+    species: pd.DataFrame
+    shifts: pd.DataFrame
+    curves: Sequence[Curve]
+    equilibria: Sequence[tuple[str, Mapping[str, Any], Sequence[str]]]
+    calibrations: Sequence[tuple[str, str, str]]
+    failed: Sequence[tuple[str, str]]
+    mass_label: str
 
+    @property
+    def links(self) -> dict[str, Any]:
+        """Every movie's name, a link to its report where there is one."""
+        pages = zip(self.movies["movie"], self.movies["report"], strict=True)
+        return {name: link(report, name) for name, report in pages}
 
-def _species(
-    species: pd.DataFrame,
-    shifts: pd.DataFrame,
-    drawn: Mapping[str, Markup],
-    mass_label: str,
-    movies: pd.DataFrame,
-) -> dict[str, Any] | None:
-    if species.empty:
-        return None
-    section = _charts("species", "Species", drawn, ("species", "shares")) or {
-        "id": "species",
-        "title": "Species",
-    }
-    tables = []
-    if len(shifts):
-        tables.append(_shift_table(shifts, mass_label))
-    tables.append(_species_table(species, mass_label, dict(_links(movies))))
-    return {**section, "notes": _species_notes(shifts), "tables": tables}
-
-
-def _species_notes(shifts: pd.DataFrame) -> list[str]:
-    text = (
-        "Species of different movies are one kind where their masses are within 10 % or three "
-        "standard errors."
-    )
-    if shifts.empty:
-        return [text]
-    reference = shifts["reference"].iloc[0]
-    text += (
-        f" Samples are compared with {reference}, the first of the table: p is the chance of at "
-        "least such a shift where there is none, corrected for the number of comparisons (Holm)."
-        " The error of the mass scale, which all movies of the day share, is not in the shifts."
-    )
-    if shifts["scatter"].isna().any():
-        text += (
-            " Kinds without replicates are compared with their counting errors alone, which do not "
-            "hold how movies of one sample differ: record replicates before believing a small p."
-        )
-    return [text]
-
-
-def _shift_table(shifts: pd.DataFrame, mass_label: str) -> dict[str, Any]:
-    """Lay out one row for each kind and sample: mass, shift, share, shift."""
-    masses = shifts[shifts["quantity"] == "mass_kda"]
-    parts = shifts[shifts["quantity"] == "share"].set_index(["kind", "sample"])
-    rows = []
-    for row in masses.to_dict("records"):
-        part = parts.loc[(row["kind"], row["sample"])].to_dict()
-        rows.append(
-            [
-                f"{row['kind_mass_kda']:.3g}",
-                unbroken(row["sample"]),
-                unbroken(row["condition"] or "—"),
-                int(row["movies"]),
-                *with_interval(row["value"], row["low"], row["high"]),
-                *with_interval(row["shift"], row["shift_low"], row["shift_high"]),
-                probability(row["p_holm"]),
-                *with_interval(*(100 * part[name] for name in ("value", "low", "high")), unit=" %"),
-                *with_interval(
-                    *(100 * part[name] for name in ("shift", "shift_low", "shift_high")), unit=" %"
-                ),
-                probability(part["p_holm"]),
-            ]
-        )
-    columns = [
-        {"label": "kind [kDa]", "numeric": True},
-        "sample",
-        "condition",
-        {"label": "movies", "numeric": True},
-        {"label": mass_label, "numeric": True},
-        {"label": "95 %", "numeric": True, "title": "with the scatter between movies"},
-        {"label": "shift [kDa]", "numeric": True},
-        {"label": "95 %", "numeric": True},
-        {"label": "p", "numeric": True, "title": "corrected for the number of comparisons"},
-        {"label": "share", "numeric": True, "title": _SHARE},
-        {"label": "95 %", "numeric": True},
-        {"label": "shift", "numeric": True},
-        {"label": "95 %", "numeric": True},
-        {"label": "p", "numeric": True, "title": "corrected for the number of comparisons"},
-    ]
-    caption = "Species by sample, and their shifts"
-    return {"caption": caption, "columns": columns, "rows": rows, "tall": len(rows) > LONG}
-
-
-def _species_table(
-    species: pd.DataFrame, mass_label: str, links: Mapping[str, Any]
-) -> dict[str, Any]:
-    rows = []
-    for row in species.to_dict("records"):
-        rows.append(
-            [
-                "apart" if row["outlier"] else str(row["kind"]),
-                links.get(row["movie"], row["movie"]),
-                unbroken(row["sample"]),
-                unbroken(row["condition"] or "—"),
-                row["concentration_nm"],
-                *with_interval(row["mass_kda"], row["mass_low"], row["mass_high"]),
-                *with_interval(row["width_kda"], row["width_low"], row["width_high"]),
-                f"{row['count']:.0f}",
-                *with_interval(
-                    *(100 * row[name] for name in ("share", "share_low", "share_high")), unit=" %"
-                ),
-                f"{100 * row['efficiency']:.0f} %",
-            ]
-        )
-    columns = [
-        {"label": "kind", "title": "one number for species of one mass; apart: an outlier"},
-        "movie",
-        "sample",
-        "condition",
-        {"label": "c [nM]", "numeric": True},
-        {"label": mass_label, "numeric": True},
-        {"label": "95 %", "numeric": True},
-        {"label": "width [kDa]", "numeric": True, "title": "beyond the events' errors"},
-        {"label": "95 %", "numeric": True},
-        {"label": "events", "numeric": True},
-        {"label": "share", "numeric": True, "title": _SHARE},
-        {"label": "95 %", "numeric": True},
-        {"label": "detected", "numeric": True},
-    ]
-    caption = "Species by movie"
-    return {"caption": caption, "columns": columns, "rows": rows, "tall": len(rows) > LONG}
-
-
-def _binding(
-    equilibria: Sequence[tuple[str, Mapping[str, Any], Sequence[str]]],
-) -> Iterator[tuple[str, Figure]]:
-    """Draw the figure of every series: kd, kd_2, …."""
-    for n, (_, found, _) in enumerate(equilibria, 1):
-        for name, figure in binding_figure(jsonable(found)):
-            yield (name if n == 1 else f"{name}_{n}"), figure
-
-
-def _equilibria(
-    equilibria: Sequence[tuple[str, Mapping[str, Any], Sequence[str]]], drawn: Mapping[str, Markup]
-) -> dict[str, Any] | None:
-    """Tabulate K_D of every series, and whether the movies follow the equilibrium."""
-    if not equilibria:
-        return None
-    section = _charts("equilibrium", "Equilibrium", drawn, ("kd",)) or {}
-    charts = section["charts"]
-    rows = []
-    for chart, (condition, found, notes) in zip(charts, equilibria, strict=True):
-        chart["title"] = f"K_D, {condition}" if condition else "K_D"
-        kd, low, high = (found[name] for name in ("kd_nm", "kd_low", "kd_high"))
-        rows.append(
-            [
-                condition or "—",
-                {"dimer": "2 M ⇌ D", "ab": "A + B ⇌ AB"}[found["model"]],
-                len(found["samples"]),
-                number(kd),
-                f"{number(low)} to {number(high) if math.isfinite(high) else '∞'}",
-                probability(found["p_value"]),
-                "; ".join(notes) or "none",
-            ]
-        )
-    columns = [
-        "condition",
-        "reaction",
-        {"label": "movies", "numeric": True},
-        {"label": "K_D [nM]", "numeric": True},
-        {"label": "95 %", "numeric": True, "title": "of the profile likelihood"},
-        {"label": "p", "numeric": True, "title": "whether the movies follow the equilibrium"},
-        "remarks",
-    ]
-    return {**section, "tables": [{"columns": columns, "rows": rows}]}
-
-
-def _landing(movies: pd.DataFrame, drawn: Mapping[str, Markup]) -> dict[str, Any] | None:
-    known = movies[movies["rate"].notna()]
-    if known.empty:
-        return None
-    unit = known["rate_unit"].iloc[0]
-    links = dict(_links(movies))
-    rows = [
-        [
-            links[row["movie"]],
-            unbroken(row["sample"]),
-            unbroken(row["condition"] or "—"),
-            row["concentration_nm"],
-            int(row["landings"]),
-            int(row["leavings"]),
-            *with_interval(row["rate"], row["rate_from"], row["rate_to"]),
+    @property
+    def labels(self) -> list[Column]:
+        """Columns that say which movie a row is of."""
+        links = self.links
+        return [
+            worded("movie", lambda row: links.get(row["movie"], row["movie"])),
+            *_SAMPLE,
+            numeric("c [nM]", "concentration_nm"),
         ]
-        for row in known.to_dict("records")
-    ]
-    columns = [
-        "movie",
-        "sample",
-        "condition",
-        {"label": "c [nM]", "numeric": True},
-        {"label": "landed", "numeric": True},
-        {"label": "left", "numeric": True},
-        {"label": f"landings per {unit}", "numeric": True},
-        {"label": "95 %", "numeric": True},
-    ]
-    section = _charts("landing", "Landing", drawn, ("rates",)) or {}
-    table = {"caption": "Landings", "columns": columns, "rows": rows, "tall": len(rows) > LONG}
-    return {**section, "id": "landing", "title": "Landing", "tables": [table]}
 
 
-def _quality(movies: pd.DataFrame) -> dict[str, Any]:
-    """Tabulate the quality of every movie."""
-    links = dict(_links(movies))
-    further = list(movies.attrs.get("further", ()))
-    rows = []
-    for row in movies.to_dict("records"):
-        failed = row["state"] != "done"
-        text = row["why"] if failed else row["cautions"]
-        rows.append(
-            [
-                links[row["movie"]],
-                row["role"],
-                unbroken(row["sample"]),
-                *(plain(row[name]) for name in further),
-                {"done": "done", "failed": "failed", "missing": "not yet"}[row["state"]],
-                text or "none",
-                plain(row["answer"]),
-                whole(row["events"]),
-                share(row["ok"], row["events"]),
-                fixed(row["noise_over_shot"], 2),
-                fixed(row["drift_px"], 2),
-                fixed(row["focus_shift_nm"], 0),
-                percent(row["small_p_values"]),
-                fixed(row["repeat_over_crb"], 2),
-                row["standards_seen"] or "—",
-                unbroken(row["optics"] or "—", 80),
-                unbroken(row["mass_scale"] or "—", 80),
-                percent(row["outside_standards"]),
-            ]
-        )
-    columns = [
-        "movie",
-        "role",
-        "sample",
-        *further,
-        "state",
-        "cautions",
-        "answer",
-        {"label": "events", "numeric": True},
-        {"label": "ok", "numeric": True, "title": "events with status ok"},
-        {"label": "noise", "numeric": True, "title": "variance over shot noise, in its windows"},
-        {"label": "drift [px]", "numeric": True, "title": "of the fixed pattern"},
-        {"label": "focus [nm]", "numeric": True, "title": "from the day's, where it was measured"},
-        {"label": "p < 0.01", "numeric": True, "title": "1 % where the model holds"},
-        {"label": "spread/CRB", "numeric": True, "title": "measured between parts of the frames"},
-        "standards",
-        "optics",
-        "mass scale",
-        {"label": "beyond", "numeric": True, "title": "masses beyond the standards"},
-    ]
-    table = {"columns": columns, "rows": rows, "tall": len(rows) > LONG}
-    return {"id": "quality", "title": "Movies and their quality", "tables": [table]}
+_SAMPLE = (worded("sample", of("sample", unbroken)), worded("condition", of("condition", unbroken)))
 
 
-def _links(movies: pd.DataFrame) -> list[tuple[str, Any]]:
-    """Make every movie's name a link to its report, where there is one."""
-    pages = zip(movies["movie"], movies["report"], strict=True)
-    return [(name, link(report, name)) for name, report in pages]
+def batch_page(title: str, subtitle: str, batch: BatchContents, folder: Path | None = None) -> str:
+    """Make the page of a batch, and write its figures."""
+    drawn = publish(_figures(batch), folder, printed=True)
+    masses = _charts(drawn, "overlaid", "stacked")
+    sections = [_overview(batch)]
+    if masses:
+        sections.append(Section("masses", "Masses", charts=masses))
+    if len(batch.species):
+        sections.append(_species_section(batch, drawn))
+    if batch.equilibria:
+        sections.append(_equilibria(batch, drawn))
+    if batch.movies["rate"].notna().any():
+        sections.append(_landing(batch, drawn))
+    sections.append(_quality(batch))
+    return render_document(title, subtitle, sections)
 
 
 def summary_line(movies: pd.DataFrame) -> str:
     """Describe the batch in one line."""
     return f"{count(len(movies), 'movie')} of {count(movies['sample'].nunique(), 'sample')}"
+
+
+def _table(rows: pd.DataFrame, columns: Sequence[Column], caption: str = "") -> Table:
+    """Make a table of a data frame, which scrolls if it is long."""
+    made = tabulate(rows.to_dict("records"), columns, caption)
+    return replace(made, tall=len(rows) > LONG)
+
+
+def _charts(drawn: Mapping[str, Markup], *kinds: str) -> list[Chart]:
+    charts = []
+    for figure, svg in drawn.items():
+        kind, _, nth = figure.partition("_")
+        if kind in kinds:
+            title, caption = _CHARTS[kind]
+            name = f"figure-{figure.replace('_', '-')}"
+            words = (f"{title}, {nth}", "") if nth else (title, caption)
+            charts.append(Chart(name, words[0], svg, words[1], wide=True))
+    return charts
+
+
+# ---- Sections ------------------------------------------------------------------------------------
+
+
+def _overview(batch: BatchContents) -> Section:
+    movies = batch.movies
+    done = movies[movies["state"] == "done"]
+    analysed = done[done["role"] != "flat"]
+    cautioned = int((done["cautions"].fillna("") != "").sum())
+    facts = [
+        Fact(
+            "Movies",
+            str(len(done)),
+            note=f"of {len(movies)}" if len(done) < len(movies) else "all of the table",
+        ),
+        Fact("Samples", str(analysed["sample"].nunique())),
+        Fact("Events", str(int(analysed["events"].sum()))),
+        Fact("With cautions", str(cautioned), note="see the quality"),
+    ]
+    failed = tabulate(batch.failed, (worded("not analysed", 0), worded("why", 1)))
+    columns = worded("calibration", lambda row: link(row[2], row[0])), worded("from", 1)
+    tables = [*([failed] if batch.failed else []), tabulate(batch.calibrations, columns)]
+    return Section("day", "The day", facts=facts, tables=tables)
+
+
+def _species_section(batch: BatchContents, drawn: Mapping[str, Markup]) -> Section:
+    tables = [_shift_table(batch)] if len(batch.shifts) else []
+    return Section(
+        "species",
+        "Species",
+        charts=_charts(drawn, "species", "shares"),
+        notes=[_species_note(batch.shifts)],
+        tables=[*tables, _species_table(batch)],
+    )
+
+
+def _species_note(shifts: pd.DataFrame) -> str:
+    note = (
+        "Species of different movies are one kind where their masses are within 10 % or three "
+        "standard errors."
+    )
+    if shifts.empty:
+        return note
+    note += (
+        f" Samples are compared with {shifts['reference'].iloc[0]}, the first of the table: p is "
+        "the chance of at least such a shift where there is none, corrected for the number of "
+        "comparisons (Holm). The error of the mass scale, which all movies of the day share, is "
+        "not in the shifts."
+    )
+    if shifts["scatter"].isna().any():
+        note += (
+            " Kinds without replicates are compared with their counting errors alone, which do not "
+            "hold how movies of one sample differ: record replicates before believing a small p."
+        )
+    return note
+
+
+def _shift_table(batch: BatchContents) -> Table:
+    """Lay out one row for each kind and sample: mass, shift, share, shift."""
+    of_kind = batch.shifts.set_index("quantity")
+    masses, shares = (of_kind.loc[[name]] for name in ("mass_kda", "share"))
+    both = masses.merge(shares, on=["kind", "sample"], suffixes=("", "_of_share"))
+
+    def columns(label: str, end: str, scale: float, unit: str, *titles: str) -> list[Column]:
+        value = (f"value{end}", f"low{end}", f"high{end}")
+        shift = (f"shift{end}", f"shift_low{end}", f"shift_high{end}")
+        how: dict[str, Any] = {"scale": scale, "unit": unit}
+        return [
+            *intervals(label, value, titles=(titles[0], titles[1]), **how),
+            *intervals(titles[2], shift, **how),
+            numeric("p", of(f"p_holm{end}", probability), _HOLM),
+        ]
+
+    every = [
+        numeric("kind [kDa]", of("kind_mass_kda", "{:.3g}".format)),
+        *_SAMPLE,
+        numeric("movies", of("movies", int)),
+        *columns(batch.mass_label, "", 1, "", "", "with the scatter between movies", "shift [kDa]"),
+        *columns("share", "_of_share", 100, " %", _SHARE, "", "shift"),
+    ]
+    return _table(both, every, "Species by sample, and their shifts")
+
+
+def _species_table(batch: BatchContents) -> Table:
+    columns = [
+        worded(
+            "kind",
+            lambda row: "apart" if row["outlier"] else str(row["kind"]),
+            "one number for species of one mass; apart: an outlier",
+        ),
+        *batch.labels,
+        *intervals(batch.mass_label, ("mass_kda", "mass_low", "mass_high")),
+        *intervals(
+            "width [kDa]",
+            ("width_kda", "width_low", "width_high"),
+            titles=("beyond the events' errors", ""),
+        ),
+        numeric("events", of("count", fixed, 0)),
+        *intervals(
+            "share", ("share", "share_low", "share_high"), scale=100, unit=" %", titles=(_SHARE, "")
+        ),
+        numeric("detected", of("efficiency", percent, 0)),
+    ]
+    return _table(batch.species, columns, "Species by movie")
+
+
+def _equilibria(batch: BatchContents, drawn: Mapping[str, Markup]) -> Section:
+    """Tabulate K_D of every series, and whether the movies follow the equilibrium."""
+    charts = [
+        replace(chart, title=f"K_D, {condition}" if condition else "K_D")
+        for chart, (condition, *_) in zip(_charts(drawn, "kd"), batch.equilibria, strict=True)
+    ]
+
+    def ends(row: Any) -> str:
+        low, high = row[1]["kd_low"], row[1]["kd_high"]
+        return f"{number(low)} to {number(high) if math.isfinite(high) else '∞'}"
+
+    reactions = {"dimer": "2 M ⇌ D", "ab": "A + B ⇌ AB"}
+    columns = [
+        worded("condition", lambda row: row[0] or "—"),
+        worded("reaction", lambda row: reactions[row[1]["model"]]),
+        numeric("movies", lambda row: len(row[1]["samples"])),
+        numeric("K_D [nM]", lambda row: number(row[1]["kd_nm"])),
+        numeric("95 %", ends, "of the profile likelihood"),
+        numeric(
+            "p",
+            lambda row: probability(row[1]["p_value"]),
+            "whether the movies follow the equilibrium",
+        ),
+        worded("remarks", lambda row: "; ".join(row[2]) or "none"),
+    ]
+    tables = [tabulate(batch.equilibria, columns)]
+    return Section("equilibrium", "Equilibrium", charts=charts, tables=tables)
+
+
+def _landing(batch: BatchContents, drawn: Mapping[str, Markup]) -> Section:
+    known = batch.movies[batch.movies["rate"].notna()]
+    columns = [
+        *batch.labels,
+        numeric("landed", of("landings", int)),
+        numeric("left", of("leavings", int)),
+        *intervals(f"landings per {known['rate_unit'].iloc[0]}", ("rate", "rate_from", "rate_to")),
+    ]
+    tables = [_table(known, columns, "Landings")]
+    return Section("landing", "Landing", charts=_charts(drawn, "rates"), tables=tables)
+
+
+def _quality(batch: BatchContents) -> Section:
+    """Tabulate the quality of every movie."""
+    links, states = batch.links, {"done": "done", "failed": "failed", "missing": "not yet"}
+
+    def cautions(row: Any) -> str:
+        return row["cautions" if row["state"] == "done" else "why"] or "none"
+
+    columns = [
+        worded("movie", lambda row: links[row["movie"]]),
+        worded("role", "role"),
+        _SAMPLE[0],
+        *(worded(name, of(name, plain)) for name in batch.movies.attrs.get("further", ())),
+        worded("state", of("state", states.get)),
+        worded("cautions", cautions),
+        worded("answer", of("answer", plain)),
+        numeric("events", of("events", _whole)),
+        numeric("ok", lambda row: _share(row["ok"], row["events"]), "events with status ok"),
+        numeric(
+            "noise", of("noise_over_shot", fixed, 2), "variance over shot noise, in its windows"
+        ),
+        numeric("drift [px]", of("drift_px", fixed, 2), "of the fixed pattern"),
+        numeric(
+            "focus [nm]", of("focus_shift_nm", fixed, 0), "from the day's, where it was measured"
+        ),
+        numeric("p < 0.01", of("small_p_values", percent, 1), "1 % where the model holds"),
+        numeric(
+            "spread/CRB", of("repeat_over_crb", fixed, 2), "measured between parts of the frames"
+        ),
+        worded("standards", of("standards_seen", unbroken)),
+        worded("optics", of("optics", unbroken, 80)),
+        worded("mass scale", of("mass_scale", unbroken, 80)),
+        numeric("beyond", of("outside_standards", percent, 1), "masses beyond the standards"),
+    ]
+    return Section("quality", "Movies and their quality", tables=[_table(batch.movies, columns)])
+
+
+def _whole(value: float | None) -> int | None:
+    return int(value) if value is not None and math.isfinite(value) else None
+
+
+def _share(part: float, whole: float) -> str:
+    return percent(part / whole, 1) if whole and math.isfinite(whole) else "—"
+
+
+# ---- Figures -------------------------------------------------------------------------------------
+
+
+def _figures(batch: BatchContents) -> Iterator[tuple[str, Figure]]:
+    """Draw the figures of a batch."""
+    species = batch.species[~batch.species["outlier"]]
+    shown = [curve for curve in batch.curves if curve.masses_kda.size]
+    if shown:
+        # the axis of masses ends beyond every species and almost all events
+        almost = np.quantile(np.concatenate([curve.masses_kda for curve in shown]), 0.995)
+        limit = 1.1 * float(np.fmax(almost, species["mass_kda"].max() if len(species) else 0))
+        yield "overlaid", _overlaid(shown, limit, batch.mass_label)
+        samples = list(dict.fromkeys((curve.group, curve.sample) for curve in shown))
+        order = list(dict.fromkeys(group for group, _ in samples))
+        samples.sort(key=lambda pair: order.index(pair[0]))
+        edges = np.linspace(0, limit, 61)
+        for start in range(0, len(samples), LONG):
+            name = "stacked" if start == 0 else f"stacked_{start // LONG + 1}"
+            rows = {pair: order.index(pair[0]) for pair in samples[start : start + LONG]}
+            yield name, _stacked(shown, rows, edges, batch.mass_label, shades(len(order)))
+    if len(species):
+        yield "species", _species(species, batch.mass_label)
+        known = species[species["concentration_nm"] > 0]
+        if known["concentration_nm"].nunique() > 1:
+            yield "shares", _shares(known)
+    rates = batch.movies[batch.movies["rate"].notna()]
+    if len(rates):
+        yield "rates", _rates(rates)
+    for n, (_, found, _) in enumerate(batch.equilibria, 1):
+        for name, figure in binding_figure(jsonable(found)):
+            yield (name if n == 1 else f"{name}_{n}"), figure
+
+
+def shades(count: int) -> list[str]:
+    """Give colours that can be told apart: named ones, or steps of a scale where there are many."""
+    if count <= len(_COLORS):
+        return list(_COLORS[:count])
+    scale = mpl.colormaps["viridis"]
+    return [to_hex(scale(0.05 + 0.8 * k / (count - 1))) for k in range(count)]
+
+
+def _panels(
+    groups: Sequence[str], height: float, x_label: str, y_label: str
+) -> tuple[Figure, list[Axes]]:
+    """Make a panel for each group, two in a row, all with the same axes."""
+    columns = min(len(groups), 2)
+    rows = math.ceil(len(groups) / columns)
+    figure = new_figure(_WIDTH, 0.5 + height * rows)
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    panels: list[Axes] = list(grid.ravel())
+    for panel in panels[len(groups) :]:
+        panel.set_visible(False)
+    for panel in panels[max(0, len(groups) - columns) : len(groups)]:
+        panel.tick_params(labelbottom=True)
+    figure.supxlabel(x_label, fontsize=9)
+    figure.supylabel(y_label, fontsize=9)
+    return figure, panels[: len(groups)]
+
+
+def _overlaid(curves: Sequence[Curve], limit: float, label: str) -> Figure:
+    """Draw one panel for each group, all movies with the same axes."""
+    groups = list(dict.fromkeys(curve.group for curve in curves))
+    figure, panels = _panels(groups, 2.1, label, "events per kDa [%]")
+    for group, panel in zip(groups, panels, strict=True):
+        inside = [curve for curve in curves if curve.group == group]
+        samples = list(dict.fromkeys(curve.sample for curve in inside))
+        for sample, color in zip(samples, shades(len(samples)), strict=True):
+            label_once = in_figure(sample) if len(samples) <= _NAMED else None
+            for curve in (c for c in inside if c.sample == sample and c.density.size):
+                density = 100 * curve.density / curve.masses_kda.size
+                panel.plot(curve.grid_kda, density, color=color, lw=1, label=label_once)
+                label_once = None
+        if group or len(groups) > 1:
+            panel.set_title(in_figure(group) or "no condition")
+        if panel.get_legend_handles_labels()[0]:
+            panel.legend(fontsize=6, ncols=1 if 2 * len(samples) <= _NAMED else 2)
+        elif len(samples) > _NAMED:
+            title = f"{in_figure(group)}: {len(samples)} samples, from dark to bright"
+            panel.set_title(title.strip(": "))
+    panels[0].set(xlim=(0, limit))
+    panels[0].set_ylim(0, 1.25 * panels[0].get_ylim()[1])  # with room for its legend
+    return figure
+
+
+def _stacked(
+    curves: Sequence[Curve],
+    rows: Mapping[tuple[str, str], int],
+    edges: FloatArray,
+    label: str,
+    colors: Sequence[str],
+) -> Figure:
+    """Draw one row for each sample, with the number of its group; all have the same scale."""
+    means, names = {}, []
+    for group, sample in rows:
+        own = [c.masses_kda for c in curves if (c.group, c.sample) == (group, sample)]
+        shares = [100 * np.histogram(masses, edges)[0] / masses.size for masses in own]
+        means[group, sample] = np.mean(shares, axis=0)
+        several = len(colors) > 1 and group and group != sample
+        name = _shortened(f"{group}: {sample}" if several else sample, 34)
+        names.append(f"{name}  ({sum(masses.size for masses in own)})")
+    step = 1.05 * max(float(mean.max()) for mean in means.values())
+    figure = new_figure(_WIDTH, 0.9 + 0.29 * len(rows))
+    axes = figure.add_subplot()
+    for k, (key, mean) in enumerate(means.items()):
+        base, color = -k * step, colors[rows[key]]
+        axes.stairs(base + mean, edges, baseline=base, fill=True, color=color, alpha=0.35, lw=0)
+        axes.stairs(base + mean, edges, baseline=None, color=color, lw=0.8)
+    axes.set_yticks([-k * step for k in range(len(rows))], names, fontsize=7)
+    axes.tick_params(axis="y", length=0)
+    axes.spines["left"].set_visible(False)
+    axes.set(xlim=(0, edges[-1]), ylim=(-(len(rows) - 1) * step - 0.05 * step, step * 1.05))
+    axes.set_xlabel(label)
+    return figure
+
+
+def _shortened(name: str, longest: int) -> str:
+    return in_figure(name if len(name) <= longest else f"{name[: longest - 1]}…")
+
+
+def _places(table: pd.DataFrame, axes: Axes) -> FloatArray:
+    """Position of the sample of every row on an axis with the names of samples."""
+    samples = list(dict.fromkeys(table["sample"]))
+    place = {sample: k for k, sample in enumerate(samples)}
+    # Movies of one sample stand beside each other.
+    turn = table.groupby("sample")["movie"].transform(lambda m: pd.factorize(m)[0]).to_numpy(float)
+    many = table.groupby("sample")["movie"].transform("nunique").to_numpy(float)
+    every = math.ceil(len(samples) / 24)
+    names = [_shortened(sample, 22) for sample in samples[::every]]
+    axes.set_xticks(range(0, len(samples), every), names, fontsize=7)
+    axes.tick_params(axis="x", rotation=90 if len(names) > 6 else 0)
+    axes.set_xlim(-0.6, len(samples) - 0.4)
+    middle = np.array([place[s] for s in table["sample"]], dtype=np.float64)
+    return np.asarray(middle + 0.5 * ((turn + 0.5) / many - 0.5))
+
+
+def _points(
+    axes: Axes, x: FloatArray, rows: pd.DataFrame, names: Sequence[str], **style: Any
+) -> None:
+    """Draw values and intervals of rows; `names` are the columns of value, lower and upper end."""
+    value, low, high = (rows[name].to_numpy(float) for name in names)
+    whiskers(axes, x, value, (low, high), ms=3.5, ls="none", capsize=0, **style)
+
+
+def _species(species: pd.DataFrame, label: str) -> Figure:
+    """Draw mass of every species against the sample."""
+    figure = new_figure(_WIDTH, 3.4)
+    axes = figure.add_subplot()
+    place = _places(species, axes)
+    kinds = sorted(species["kind"].unique())
+    for kind, color in zip(kinds, shades(len(kinds)), strict=True):
+        chosen = (species["kind"] == kind).to_numpy()
+        names = ("mass_kda", "mass_low", "mass_high")
+        _points(axes, place[chosen], species[chosen], names, color=color)
+    axes.set_ylabel(label)
+    masses = species["mass_kda"]
+    if masses.max() > 5 * max(masses.min(), 1e-9):
+        plain_log(axes, "y")
+    axes.grid(axis="y", color=GRID, lw=0.6)
+    return figure
+
+
+def _shares(species: pd.DataFrame) -> Figure:
+    """Draw the share of every species against the concentration, a panel for each group."""
+    groups = list(dict.fromkeys(species["group"]))
+    labels = "concentration [nM]", "share of the particles that came"
+    figure, panels = _panels(groups, 2.2, *labels)
+    kinds = sorted(species["kind"].unique())
+    mean = species.groupby("kind")["mass_kda"].mean()
+    handles: dict[str, Any] = {}
+    for group, panel in zip(groups, panels, strict=True):
+        for kind, color in zip(kinds, shades(len(kinds)), strict=True):
+            chosen = species[(species["kind"] == kind) & (species["group"] == group)]
+            if chosen.empty:
+                continue
+            label = f"{mean[kind]:.3g} kDa" if len(kinds) <= _NAMED else None
+            names, x = ("share", "share_low", "share_high"), chosen["concentration_nm"]
+            _points(panel, x.to_numpy(float), chosen, names, color=color, label=label)
+        panel.set_title(in_figure(group))
+        marks, words = panel.get_legend_handles_labels()
+        handles |= dict(zip(words, marks, strict=True))
+    plain_log(panels[0], "x")
+    panels[0].set(ylim=(-0.03, 1.3), yticks=[0, 0.25, 0.5, 0.75, 1])
+    if handles:
+        entries = list(handles.values()), list(handles)
+        panels[0].legend(*entries, fontsize=6, ncols=2, loc="upper left")
+    return figure
+
+
+def _rates(movies: pd.DataFrame) -> Figure:
+    """Draw how many landed per time, against concentration where it is known, else the sample."""
+    known = movies[movies["concentration_nm"] > 0]
+    against = known["concentration_nm"].nunique() > 1
+    figure = new_figure(_WIDTH, 3.2)
+    axes = figure.add_subplot()
+    table = known if against else movies
+    x = table["concentration_nm"].to_numpy(float) if against else _places(table, axes)
+    groups = list(dict.fromkeys(table["group"]))
+    for group, color in zip(groups, shades(len(groups)), strict=True):
+        chosen = (table["group"] == group).to_numpy()
+        label = (in_figure(group) or "no condition") if 1 < len(groups) <= _NAMED else None
+        names = ("rate", "rate_from", "rate_to")
+        _points(axes, x[chosen], table[chosen], names, color=color, label=label)
+    blank = movies[movies["role"] == "blank"]
+    if against and len(blank):
+        axes.axhline(float(blank["rate"].mean()), color=INK, lw=0.8, ls=":", label="blank")
+    if against:
+        plain_log(axes, "x")
+        axes.set_xlabel("concentration [nM]")
+    axes.set_ylim(bottom=0)
+    axes.yaxis.set_major_locator(MaxNLocator(6))
+    axes.set_ylabel(f"landings per {movies['rate_unit'].iloc[0]}")
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure

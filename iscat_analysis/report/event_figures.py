@@ -1,53 +1,64 @@
-"""The images and the posterior of single events."""
+"""Single events and tracks: their images, traces, films and posteriors, on a page or in files."""
 
 from __future__ import annotations
 
+import base64
+import io
+import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
-from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
+from PIL import Image, WebPImagePlugin
 
-from iscat_analysis.records import Analysis, EventView, FloatArray, PosteriorResult
-from iscat_analysis.report.films import clip_shown
-from iscat_analysis.report.numbers import LABELS, UNITS, number
-from iscat_analysis.report.scales import (
-    DIVERGING,
-    GREYS,
+from iscat_analysis.config import SCHEMES
+from iscat_analysis.records import Analysis, Clip, EventView, FloatArray, PosteriorResult, Trace
+from iscat_analysis.report.numbers import number, parameter
+from iscat_analysis.report.style import (
+    BLUE,
+    GREY,
+    INK,
+    VERMILLION,
+    Sketch,
+    Style,
     display_range,
-    png_of,
-    residual_limit,
-    shaded,
+    new_figure,
+    scale_bar,
 )
-from iscat_analysis.report.style import BLUE, INK, Sketch, new_figure
-from iscat_analysis.report.traces import draw_trace, trace_svg, trace_words
+from iscat_analysis.units import count
 
 CORNER_FIGURES = 20
 """Posteriors that are drawn, at most."""
 
-DETAIL_BYTES = 2_000_000
-"""Images, traces and clips of events inside the page, at most; the events after that are table rows
-only."""
+DETAIL_BYTES, FILM_BYTES = 2_000_000, 3_000_000
+"""Images, traces and clips of events inside the page, at most, and films; what comes after that is
+left out."""
 
 CREDIBLE_LEVELS = (0.95, 0.75, 0.5, 0.25)
 """Shades of a posterior's joint densities: the share of the probability inside each."""
 
-POSTERIOR_BINS = 24
-"""Bins per axis of a drawn posterior."""
+CLIP_MS = 180
+"""Time for which a frame of a clip is shown."""
 
+DIVERGING = LinearSegmentedColormap.from_list("residual", ["#00528C", "#FAFAF8", "#BE4600"])
+"""Colours of residuals."""
+
+_GREYS = mpl.colormaps["gray"]
+_NOTHING = 255  # of a palette: transparent
+_SHADES = 48  # of each scale of images and films: noise hides the steps
+_CLIP_SHADES = 24  # of a clip, of which a page holds hundreds
 _TRACE_INCHES = 2.1  # height of a drawn trace
-_SHADES = 64  # of each scale of the images in the page
-
-HALO = [withStroke(linewidth=1.6, foreground="black", alpha=0.7)]
-"""Makes white text readable on any image."""
 
 
 class EventDetail(NamedTuple):
@@ -61,11 +72,184 @@ class EventDetail(NamedTuple):
     sliding: str
 
 
+@dataclass(frozen=True)
+class FilmShown:
+    """One film as the page shows it."""
+
+    track: int
+    why: str
+    scales: str
+    film: str
+    still: str
+    width: int
+    height: int
+
+
+# ---- Images and films inside the page ------------------------------------------------------------
+
+
+def event_details(analysis: Analysis, table: pd.DataFrame) -> dict[int, EventDetail]:
+    """Pack what the page shows of the first events, as many as `DETAIL_BYTES` hold."""
+    packed: dict[int, EventDetail] = {}
+    spent = 0
+    for row, view in views_of_rows(table, analysis.views):
+        scale = _Scale.of(view, analysis.scheme)
+        trace = clip = Markup()
+        words = sliding = ""
+        if view.trace is not None:
+            trace, words = trace_svg(view.trace), trace_words(view.trace)
+        if view.clip is not None:
+            turn = view.trace.frame if view.trace else view.clip.frames[0]
+            clip, sliding = clip_shown(view.clip, scale.low, scale.high, turn)
+        images = png_of(scale.strip(view), _PALETTE)
+        detail = EventDetail(images, scale.text, trace, words, clip, sliding)
+        spent += sum(map(len, detail))
+        if spent > DETAIL_BYTES:
+            break
+        packed[row] = detail
+    return packed
+
+
+def films_shown(analysis: Analysis, folder: Path | None = None) -> Iterator[FilmShown]:
+    """Make the films of the page, as many as `FILM_BYTES` hold."""
+    spent = 0
+    for film in analysis.films:
+        scale = _Scale.of(film, analysis.scheme)
+        pictures = [Image.fromarray(frame) for frame in _COLOURS[scale.strip(film)]]
+        moving = _animated(pictures)
+        spent += len(moving)
+        if spent > FILM_BYTES:
+            break
+        if folder is not None:
+            (folder / f"track_{film.track:04d}.webp").write_bytes(moving)
+        still = io.BytesIO()
+        pictures[0].save(still, "PNG")
+        yield FilmShown(
+            film.track,
+            film.why,
+            f"frames {film.frames[0]} to {film.frames[-1]}; {scale.text}",
+            base64.b64encode(moving).decode("ascii"),
+            base64.b64encode(still.getvalue()).decode("ascii"),
+            *pictures[0].size,
+        )
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """Greys of data and model, and colours of the residual, of one event or film."""
+
+    low: float
+    high: float
+    limit: float
+    unit: str
+
+    @classmethod
+    def of(cls, view: Any, scheme: str) -> _Scale:
+        """Choose the scales of images, or of films, with their model and residual."""
+        low, high = display_range([view.contrast, view.model], scheme)
+        return cls(low, high, residual_limit(view.residual), SCHEMES[scheme].image_unit)
+
+    @property
+    def text(self) -> str:
+        """What the shades mean."""
+        greys = f"{self.unit} {number(self.low)} to {number(self.high)}"
+        return f"{greys}; residual ±{self.limit:g} σ"
+
+    def strip(self, view: Any) -> NDArray[np.uint8]:
+        """Put data, model and residual side by side, as shades of `_PALETTE`."""
+        span = self.high - self.low
+        data, model = (shaded((part - self.low) / span, _SHADES)
+                       for part in (view.contrast, view.model))  # fmt: skip
+        residual = shaded((view.residual / self.limit + 1) / 2, _SHADES, _SHADES)
+        gap = np.full((*data.shape[:-1], 2), _NOTHING, np.uint8)
+        return np.concatenate([data, gap, model, gap, residual], axis=-1)
+
+
+def residual_limit(residual: NDArray[np.float64]) -> float:
+    """Choose the range of a residual image: four standard deviations, more where it needs more.
+
+    Shapes: `residual` (y, x).
+    """
+    values = np.abs(residual[np.isfinite(residual)])
+    return max(4.0, math.ceil(np.quantile(values, 0.995))) if values.size else 4.0
+
+
+def shaded(values: NDArray[np.floating[Any]], shades: int, first: int = 0) -> NDArray[np.uint8]:
+    """Give every pixel of an image the number of its shade, for `png_of`."""
+    inside = np.rint(np.clip(np.nan_to_num(values), 0, 1) * (shades - 1)) + first
+    return np.where(np.isfinite(values), inside, _NOTHING).astype(np.uint8)
+
+
+def _ramp(*maps: Any, shades: int) -> NDArray[np.uint8]:
+    """Make a palette, shape (n, 3), of so many shades of each colour map."""
+    colours = np.concatenate([colours(np.linspace(0, 1, shades)) for colours in maps])
+    return np.asarray(np.rint(255 * colours[:, :3]), dtype=np.uint8)
+
+
+_PALETTE = _ramp(_GREYS, DIVERGING, shades=_SHADES)
+_COLOURS = np.full((256, 3), 127, np.uint8)
+_COLOURS[: len(_PALETTE)] = _PALETTE
+
+
+def png_of(shades: NDArray[np.uint8], palette: NDArray[np.uint8]) -> str:
+    """Write a small PNG file.
+
+    Shapes: `shades` (y, x), `palette` (n, 3).
+    """
+    image = Image.fromarray(np.minimum(shades, len(palette)).astype(np.uint8))
+    image.putpalette([*palette.ravel().tolist(), 127, 127, 127])
+    buffer = io.BytesIO()
+    # noise never repeats itself: looking for that takes four times as long, and saves nothing
+    image.save(buffer, "PNG", transparency=len(palette), compress_type=Image.HUFFMAN_ONLY)
+    return base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def clip_shown(clip: Clip, low: float, high: float, still: int) -> tuple[Markup, str]:
+    """Make the film of a clip: its images below each other, of which a page shows one at a time."""
+    number, rows, columns = clip.contrast.shape
+    grey = shaded((clip.contrast - low) / (high - low), _CLIP_SHADES).reshape(-1, columns)
+    image = png_of(grey, _ramp(_GREYS, shades=_CLIP_SHADES))
+    at = int(np.argmin(np.abs(np.array(clip.frames) - still)))
+    film = Markup(
+        f'<div class="clip" style="aspect-ratio:{columns}/{rows}"><img '
+        f'style="animation:slide {CLIP_MS * number}ms steps({number}) infinite;'
+        f'--still:{-100 * at / number:.4g}%" alt="Ratiometric clip around the step" '
+        f'src="data:image/png;base64,{image}"></div>'
+    )
+    frames = count(clip.window_frames, "frame")
+    return film, (
+        f"{frames} over the {clip.window_frames} before them, from frame {clip.frames[0]} on to "
+        f"{clip.frames[-1]}; grey as in the data"
+    )
+
+
+def _animated(pictures: list[Image.Image]) -> bytes:
+    buffer, kind = io.BytesIO(), WebPImagePlugin.WebPImageFile  # else all kinds are loaded for it
+    how: Style = {"lossless": True, "quality": 60, "method": 4, "minimize_size": False}
+    loop: Style = {"save_all": True, "append_images": pictures[1:], "duration": 120, "loop": 0}
+    pictures[0].save(buffer, kind.format, **loop, **how)
+    return buffer.getvalue()
+
+
+def views_of_rows(table: pd.DataFrame, views: Sequence[EventView]) -> list[tuple[int, EventView]]:
+    """Assign views to rows: by position where the numbers agree, else by number."""
+    numbers = table["event"].tolist()
+    if [view.event for view in views] == numbers:
+        return list(enumerate(views))
+    first: dict[int, int] = {}
+    for row, event in enumerate(numbers):
+        first.setdefault(event, row)
+    return [(first[view.event], view) for view in views if view.event in first]
+
+
+# ---- Figures -------------------------------------------------------------------------------------
+
+
 def event_figures(analysis: Analysis, most: int) -> Iterator[Sketch]:
     """Name the images of the first events, and what draws them."""
-    seen: dict[int, int] = {}
+    times: dict[int, int] = {}
     for view in analysis.views[:most]:
-        seen[view.event] = nth = seen.get(view.event, 0) + 1
+        times[view.event] = nth = times.get(view.event, 0) + 1
         name = f"event_{view.event:04d}" + (f"_{nth}" if nth > 1 else "")
         yield name, partial(triptych, view, analysis.scheme, analysis.pixel_size_nm)
 
@@ -81,54 +265,78 @@ def corner_figures(analysis: Analysis) -> Iterator[Sketch]:
         yield f"corner_{event:04d}", partial(corner, posterior, event)
 
 
-def event_details(analysis: Analysis, table: pd.DataFrame) -> dict[int, EventDetail]:
-    """Pack what the page shows of the first events, as many as `DETAIL_BYTES` hold."""
-    unit = "photoelectrons" if analysis.scheme == "darkfield" else "contrast"
-    packed: dict[int, EventDetail] = {}
-    spent = 0
-    for row, view in views_of_rows(table, analysis.views):
-        low, high = display_range([view.contrast, view.model], analysis.scheme)
-        limit = residual_limit(view.residual)
-        scales = f"{unit} {number(low)} to {number(high)}; residual ±{limit:g} σ"
-        images = _strip(view, low, high, limit)
-        trace = clip = Markup()
-        words = sliding = ""
-        if view.trace is not None:
-            trace, words = trace_svg(view.trace), trace_words(view.trace)
-        if view.clip is not None:
-            turn = view.trace.frame if view.trace else view.clip.frames[0]
-            clip, sliding = clip_shown(view.clip, low, high, turn)
-        detail = EventDetail(images, scales, trace, words, clip, sliding)
-        spent += sum(map(len, detail))
-        if spent > DETAIL_BYTES:
-            break
-        packed[row] = detail
-    return packed
-
-
-def _strip(view: EventView, low: float, high: float, limit: float) -> str:
-    """Put data, model and residual side by side, with a palette of `_SHADES` for each scale."""
-    data, model = (
-        shaded((part - low) / (high - low), _SHADES) for part in (view.contrast, view.model)
+def triptych(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:
+    """Draw data, model and residual of one event, and its contrast against frame."""
+    rows, columns = view.contrast.shape
+    tall = 2.55 * float(np.clip(rows / columns, 0.3, 3.0))
+    below = 0.0 if view.trace is None else _TRACE_INCHES
+    height = tall + 1.0 + below
+    figure = new_figure(8.4, height, constrained=False)
+    if view.trace is not None:
+        box = (0.075, 0.5 / height, 0.875, (below - 0.6) / height)
+        draw_trace(figure.add_axes(box), view.trace)
+    scale = _Scale.of(view, scheme)
+    grey = {"cmap": "gray", "vmin": scale.low, "vmax": scale.high}
+    colour = {"cmap": DIVERGING, "vmin": -scale.limit, "vmax": scale.limit}
+    panels: tuple[tuple[str, Any, dict[str, Any], str], ...] = (
+        (f"event {view.event}, data", view.contrast, grey, scale.unit),
+        ("model", view.model, grey, scale.unit),
+        ("residual", view.residual, colour, "σ"),
     )
-    residual = shaded((view.residual / limit + 1) / 2, _SHADES, _SHADES)
-    gap = shaded(np.full((view.contrast.shape[0], 2), np.nan), _SHADES)
-    ramp = np.linspace(0, 1, _SHADES)
-    return png_of(
-        np.concatenate([data, gap, model, gap, residual], axis=1),
-        np.concatenate([GREYS(ramp), DIVERGING(ramp)]),
-    )
+    for place, (title, image, colours, label) in enumerate(panels):
+        x = 0.02 + place * 0.33
+        axes = figure.add_axes((x, (below + 0.62) / height, 0.3, tall / height))
+        shown = axes.imshow(image, interpolation="nearest", **colours)
+        axes.set(xticks=[], yticks=[], title=title)
+        axes.spines[:].set_visible(False)
+        bar = figure.add_axes((x, (below + 0.48) / height, 0.3, 0.062 / height))
+        figure.colorbar(shown, cax=bar, orientation="horizontal", label=label)
+        bar.locator_params(nbins=4)
+        if not place:
+            scale_bar(axes, columns, rows, pixel_size_nm)
+    return figure
 
 
-def views_of_rows(table: pd.DataFrame, views: Sequence[EventView]) -> list[tuple[int, EventView]]:
-    """Assign views to rows: by position where the numbers agree, else by number."""
-    numbers = table["event"].tolist()
-    if [view.event for view in views] == numbers:
-        return list(enumerate(views))
-    first: dict[int, int] = {}
-    for row, event in enumerate(numbers):
-        first.setdefault(event, row)
-    return [(first[view.event], view) for view in views if view.event in first]
+def corner(posterior: PosteriorResult, event: int) -> Figure:
+    """Draw a posterior: each parameter, and each pair."""
+    n, bins = len(posterior.names), 24
+    flat = posterior.samples.reshape(-1, n)
+    figure = new_figure(1.9 * n + 0.6, 1.9 * n + 0.6, constrained=False)
+    grid = figure.subplots(n, n, squeeze=False, gridspec_kw={"wspace": 0.08, "hspace": 0.08})
+    figure.subplots_adjust(left=0.14, right=0.98, bottom=0.12, top=0.93)
+    ends = []
+    for low, high in np.quantile(flat, [0.001, 0.999], axis=0).T:
+        pad = 0.05 * (high - low) or 0.5
+        ends.append((low - pad, high + pad))
+    quantiles = np.quantile(flat, [0.15865, 0.5, 0.84135], axis=0)
+    shades = LinearSegmentedColormap.from_list("shades", ["white", BLUE])
+    for i, j in np.ndindex(n, n):
+        axes: Any = grid[i, j]
+        if j > i:
+            axes.set_axis_off()
+            continue
+        if i == j:
+            axes.hist(flat[:, i], bins=bins, range=ends[i], color=BLUE, alpha=0.35)
+            for value in quantiles[:, i]:
+                axes.axvline(value, color=INK, lw=0.8, ls="--")
+            axes.set_yticks([])
+        else:
+            span = [ends[j], ends[i]]
+            counts, ex, ey = np.histogram2d(flat[:, j], flat[:, i], bins=bins, range=span)
+            inside: Style = {"vmin": 0, "vmax": len(CREDIBLE_LEVELS), "rasterized": True}
+            axes.pcolormesh(ex, ey, credible_shades(counts).T, cmap=shades, **inside)
+            axes.set_ylim(*ends[i])
+            axes.locator_params(axis="y", nbins=4)
+        axes.set_xlim(*ends[j])
+        axes.locator_params(axis="x", nbins=3)
+        axes.tick_params(labelbottom=i == n - 1, labelleft=not j and i > 0)
+        if i == n - 1:
+            axes.set_xlabel(parameter(posterior.names[j]))
+        if i and not j:
+            axes.set_ylabel(parameter(posterior.names[i]))
+        axes.ticklabel_format(useOffset=False)
+    figure.suptitle(f"Posterior of event {event}", x=0.14, ha="left", fontsize=10)
+    return figure
 
 
 def credible_shades(counts: FloatArray) -> NDArray[np.int64]:
@@ -143,109 +351,126 @@ def credible_shades(counts: FloatArray) -> NDArray[np.int64]:
     return shades.reshape(counts.shape)
 
 
-def scale_bar(axes: Axes, columns: int, rows: int, pixel_size_nm: float) -> None:
-    """Draw a scale bar into the lower left corner of an image."""
-    bars = [50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000]
-    length_nm = max([b for b in bars if b <= 0.4 * columns * pixel_size_nm], default=bars[0])
-    x, y = 0.04 * columns - 0.5, 0.955 * rows - 0.5
-    axes.add_patch(
-        Rectangle(
-            (x, y),
-            length_nm / pixel_size_nm,
-            0.012 * rows,
-            fc="white",
-            ec="black",
-            lw=0.6,
-            zorder=3,
-        )
+# ---- Traces --------------------------------------------------------------------------------------
+
+
+def trace_svg(trace: Trace) -> Markup:
+    """Draw a trace for the page; its colours follow the theme."""
+    low, high = _range(trace)
+    frames, fine = len(trace.contrast), 1000  # steps of the curve's scale
+    margin, upper, edge = 46, 24, 474  # left and above of the curve, and where it ends
+    across, down, bottom = edge - margin, 128, 169
+
+    def left(frame: float) -> float:
+        return round(margin + (frame - trace.first) / frames * across, 1)
+
+    def top(value: float) -> float:
+        return round(upper + (high - value) / (high - low) * down, 1)
+
+    parts = []
+    for value in _ticks(low, high, 4):
+        label = f"{1e3 * value:.3g}".replace("-", "−")
+        y = top(value)
+        parts.append(f'<path class="grid" d="M{margin} {y}H{edge}"/>')
+        parts.append(f'<text x="{margin - 6}" y="{y + 4:g}" text-anchor="end">{label}</text>')
+    for value in _ticks(trace.first, trace.first + frames, 6):
+        x = left(value)
+        if value == int(value) and x < edge - 52:
+            parts.append(f'<text x="{x}" y="{bottom}" text-anchor="middle">{int(value)}</text>')
+    parts.append(f'<text x="{margin}" y="14">contrast [10⁻³]</text>')
+    parts.append(f'<text x="{edge}" y="{bottom}" text-anchor="end">frame</text>')
+    begin = left(max(trace.frame - trace.half_width, trace.first))
+    end = left(min(trace.frame + trace.half_width, trace.first + frames))
+    parts.append(
+        f'<rect class="when" x="{begin}" y="{upper}" width="{max(end - begin, 1.5):.1f}" '
+        f'height="{down}"/>'
     )
-    text = f"{length_nm / 1000:g} µm"
-    axes.text(x, y - 0.015 * rows, text, color="white", fontsize=8, path_effects=HALO, zorder=3)
+    scale = f"matrix({across / frames:.5g} 0 0 {down / fine:.5g} {margin} {upper})"
+    levels = np.rint(np.clip((high - trace.contrast) / (high - low), 0, 1) * fine)
+    centres, means = _means(trace)
+    shown = np.rint((high - means) / (high - low) * fine)
+    dots = "".join(f"M{x:g} {y:.0f}h0" for x, y in zip(centres - trace.first, shown, strict=True))
+    parts.append(
+        f'<g transform="{scale}"><path class="frames" d="{_curve(levels)}"/>'
+        f'<path class="means" d="{dots}"/></g>'
+    )
+    begin, turn, end = (left(frame) for frame in (trace.used[0], trace.frame, trace.used[1]))
+    before, after = top(trace.before), top(trace.after)
+    parts.append(f'<path class="step" d="M{begin} {before}H{turn}V{after}H{end}"/>')
+    label = f"Contrast against frame, and the fitted step at frame {trace.frame}"
+    return Markup(
+        f'<svg class="trace" viewBox="0 0 480 178" role="img" aria-label="{label}">'
+        f"{''.join(parts)}</svg>"
+    )  # numbers alone come from outside
 
 
-def triptych(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:
-    """Draw data, model and residual of one event, and its contrast against frame."""
-    rows, columns = view.contrast.shape
-    aspect = float(np.clip(rows / columns, 0.3, 3.0))
-    below = 0.0 if view.trace is None else _TRACE_INCHES
-    height = 2.55 * aspect + 1.0 + below
-    figure = new_figure(8.4, height, constrained=False)
-    if view.trace is not None:
-        draw_trace(
-            figure.add_axes((0.075, 0.5 / height, 0.875, (below - 0.6) / height)), view.trace
-        )
-    low, high = display_range([view.contrast, view.model], scheme)
-    limit = residual_limit(view.residual)
-    unit = "photoelectrons" if scheme == "darkfield" else "contrast"
-    panels: list[tuple[str, Any, Any, float, float, str]] = [
-        ("data", view.contrast, "gray", low, high, unit),
-        ("model", view.model, "gray", low, high, unit),
-        ("residual", view.residual, DIVERGING, -limit, limit, "σ"),
-    ]
-    bar_bottom, bottom = (below + 0.48) / height, (below + 0.62) / height
-    tall = 2.55 * aspect / height
-    for place, (title, image, cmap, lower, upper, label) in enumerate(panels):
-        x = 0.02 + place * 0.33
-        axes = figure.add_axes((x, bottom, 0.3, tall))
-        shown = axes.imshow(image, cmap=cmap, vmin=lower, vmax=upper, interpolation="nearest")
-        axes.set(xticks=[], yticks=[], title=f"event {view.event}, {title}" if not place else title)
-        axes.spines[:].set_visible(False)
-        bar = figure.add_axes((x, bar_bottom, 0.3, 0.062 / height))
-        figure.colorbar(shown, cax=bar, orientation="horizontal", label=label).ax.locator_params(
-            nbins=4
-        )
-        if not place:
-            scale_bar(axes, columns, rows, pixel_size_nm)
-    return figure
+def trace_words(trace: Trace) -> str:
+    """Say what a drawn trace shows."""
+    when = f"frame {trace.frame}" + (f" ± {trace.half_width}" if trace.half_width else "")
+    return (
+        f"Contrast of each frame by the matched filter; dots: means of "
+        f"{count(_length(trace), 'frame')}. Line: the fitted step, at {when}, over the frames that "
+        f"were used. Noise expected of a frame: {number(1e3 * trace.sigma, 2)}×10⁻³."
+    )
 
 
-def corner(posterior: PosteriorResult, event: int) -> Figure:
-    """Draw a posterior: each parameter, and each pair."""
-    flat = posterior.samples.reshape(-1, len(posterior.names))
-    n = len(posterior.names)
-    figure = new_figure(1.9 * n + 0.6, 1.9 * n + 0.6, constrained=False)
-    grid = figure.subplots(n, n, squeeze=False, gridspec_kw={"wspace": 0.08, "hspace": 0.08})
-    figure.subplots_adjust(left=0.14, right=0.98, bottom=0.12, top=0.93)
-    ends = []
-    for values in flat.T:
-        low, high = np.quantile(values, [0.001, 0.999])
-        pad = 0.05 * (high - low) or 0.5
-        ends.append((low - pad, high + pad))
-    quantiles = np.quantile(flat, [0.15865, 0.5, 0.84135], axis=0)
-    shades = LinearSegmentedColormap.from_list("shades", ["white", BLUE])
-    for i in range(n):
-        for j in range(n):
-            axes = grid[i][j]
-            if j > i:
-                axes.set_axis_off()
-                continue
-            label_x = f"{LABELS[posterior.names[j]]} [{UNITS[posterior.names[j]]}]"
-            if i == j:
-                axes.hist(flat[:, i], bins=POSTERIOR_BINS, range=ends[i], color=BLUE, alpha=0.35)
-                for value in quantiles[:, i]:
-                    axes.axvline(value, color=INK, lw=0.8, ls="--")
-                axes.set_yticks([])
-            else:
-                counts, ex, ey = np.histogram2d(
-                    flat[:, j], flat[:, i], bins=POSTERIOR_BINS, range=[ends[j], ends[i]]
-                )
-                axes.pcolormesh(
-                    ex, ey, credible_shades(counts).T, cmap=shades, vmin=0,
-                    vmax=len(CREDIBLE_LEVELS), rasterized=True,
-                )  # fmt: skip
-                axes.set_ylim(*ends[i])
-            axes.set_xlim(*ends[j])
-            axes.locator_params(axis="x", nbins=3)
-            if i != j:
-                axes.locator_params(axis="y", nbins=4)
-            if i < n - 1:
-                axes.tick_params(labelbottom=False)
-            else:
-                axes.set_xlabel(label_x)
-            if j or not i:
-                axes.tick_params(labelleft=False)
-            else:
-                axes.set_ylabel(f"{LABELS[posterior.names[i]]} [{UNITS[posterior.names[i]]}]")
-            axes.ticklabel_format(useOffset=False)
-    figure.suptitle(f"Posterior of event {event}", x=0.14, ha="left", fontsize=10)
-    return figure
+def draw_trace(axes: Axes, trace: Trace) -> None:
+    """Draw a trace."""
+    low, high = _range(trace)
+    frames = trace.first + np.arange(len(trace.contrast))
+    centres, means = _means(trace)
+    half, (begin, end) = max(trace.half_width, 0.5), trace.used
+    axes.axvspan(trace.frame - half, trace.frame + half, color=BLUE, alpha=0.18, lw=0)
+    axes.plot(frames + 0.5, 1e3 * trace.contrast, color=GREY, lw=0.6, alpha=0.6)
+    axes.plot(centres, 1e3 * means, ".", color=INK, ms=3.5)
+    levels = 1e3 * np.array([trace.before, trace.before, trace.after, trace.after])
+    axes.plot([begin, trace.frame, trace.frame, end], levels, color=VERMILLION, lw=1.6)
+    axes.set(xlim=(frames[0], frames[-1] + 1), ylim=(1e3 * low, 1e3 * high))
+    axes.set(xlabel="frame", ylabel="contrast [10⁻³]")
+
+
+def _range(trace: Trace) -> tuple[float, float]:
+    """Give the scale: both levels and nearly all frames, and always a proper interval."""
+    known = trace.contrast[np.isfinite(trace.contrast)]
+    ends = np.quantile(known, [0.005, 0.995]) if known.size else np.zeros(2)
+    low = min(float(ends[0]), trace.before, trace.after)
+    high = max(float(ends[1]), trace.before, trace.after)
+    margin = 0.04 * (high - low) or 1e-6
+    return low - margin, high + margin
+
+
+def _ticks(low: float, high: float, most: int) -> list[float]:
+    """Give round values within a range."""
+    values = MaxNLocator(most, steps=[1, 2, 5, 10]).tick_values(low, high)
+    return [float(value) for value in values if low <= value <= high]
+
+
+def _length(trace: Trace) -> int:
+    """Frames of a mean, of which there are about 40."""
+    return max(1, round(len(trace.contrast) / 40))
+
+
+def _means(trace: Trace) -> tuple[FloatArray, FloatArray]:
+    """Average frames, none across the step; where they lie [frames], and their means."""
+    length = _length(trace)
+    start = (trace.frame - trace.first) % length
+    number = (len(trace.contrast) - start) // length
+    parts = trace.contrast[start : start + number * length].reshape(number, length)
+    known = np.isfinite(parts)
+    some = known.any(axis=1)
+    sums = np.where(known, parts, 0.0).sum(axis=1)[some]
+    centres = trace.first + start + (np.flatnonzero(some) + 0.5) * length
+    means: FloatArray = sums / known.sum(axis=1)[some]
+    return np.asarray(centres), means
+
+
+def _curve(levels: FloatArray) -> str:
+    """Write a path of one step to the right per value; a missing value interrupts it."""
+    text = []
+    known = np.flatnonzero(np.isfinite(levels))
+    runs = np.split(known, np.flatnonzero(np.diff(known) > 1) + 1) if known.size else []
+    for run in runs:
+        values = levels[run].astype(int)
+        steps = "".join(f" 1 {step}" for step in np.diff(values).tolist())
+        text.append(f"M{run[0] + 0.5:g} {values[0]}l{steps[1:].replace(' -', '-')}")
+    return "".join(text)

@@ -1,37 +1,60 @@
-"""The figures of one analysis."""
+"""The figures of one analysis, for its folder, its page, and one at a time for a notebook."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
+from textwrap import fill
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import ScaledTranslation
 
-from iscat_analysis.records import Analysis, BoolArray, FloatArray, Status, counted, free_parameters
-from iscat_analysis.report.answer import main_quantity
-from iscat_analysis.report.budget import budget_figure
-from iscat_analysis.report.event_figures import HALO, scale_bar
-from iscat_analysis.report.field import field_axes
-from iscat_analysis.report.headline import as_contrasts, label_of
-from iscat_analysis.report.movie_figure import movie_figure
-from iscat_analysis.report.numbers import UNITS
-from iscat_analysis.report.scales import display_range
-from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, VERMILLION, Sketch, new_figure
-from iscat_analysis.report.track_figures import track_figures
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.records import (
+    PARAMETERS,
+    Analysis,
+    BoolArray,
+    EventView,
+    FloatArray,
+    PosteriorResult,
+    Status,
+    counted,
+    free_parameters,
+)
+from iscat_analysis.report import event_figures, track_figures
+from iscat_analysis.report.answer import label_of, main_quantity
+from iscat_analysis.report.numbers import LABELS, UNITS
+from iscat_analysis.report.style import (
+    BLUE,
+    GREY,
+    HALO,
+    INK,
+    PURPLE,
+    STYLE,
+    VERMILLION,
+    Sketch,
+    Style,
+    around,
+    field_figure,
+    floats,
+    legend,
+    new_figure,
+    plain_log,
+    points,
+    row_of_panels,
+    whiskers,
+)
+from iscat_analysis.report.tables import event_table
 
-NUMBERED_EVENTS = 100
-"""Events in the overview that may carry their number; the others are rings only."""
-
-LARGEST_FIELD = 640
-"""Longer side of an image of the field that is shown pixel by pixel [px]."""
-
-MOST_POINTS = 800
-"""Points of a figure that tell their event when the pointer is over them; more become an image."""
+SHOWN_FRAMES = 12
+"""Frames around its own in which an event of a landing movie is marked in a film."""
 
 _NAMES = {"mass_kda": "mass", "z_nm": "height", "n_scattered": "photon"}
 
@@ -41,7 +64,7 @@ def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[Sketch]:
     main = main_quantity(analysis).column
     fitted = np.isfinite(counted(table)[main].to_numpy(float)).any()
     if analysis.tracks is not None:
-        yield from track_figures(analysis, table)
+        yield from track_figures.track_figures(analysis, table)
     elif np.asarray(analysis.ratio_image).size:
         yield "overview", partial(overview, analysis, table)
     if fitted and analysis.tracks is None:
@@ -49,8 +72,8 @@ def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[Sketch]:
         yield "timeline", partial(timeline, analysis, table)
     if fitted:
         yield "precision", partial(precision, analysis, table)
-    yield "spread", partial(spread_figure, analysis, label_of)
-    yield "budget", partial(budget_figure, analysis)
+    yield "spread", partial(spread, analysis)
+    yield "budget", partial(budget, analysis)
     yield "diagnostics", partial(diagnostics, analysis, table)
     power_known = np.isfinite(np.asarray(analysis.power, float))
     if analysis.summary.get("timeline"):  # which has the power of every frame too
@@ -59,130 +82,89 @@ def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[Sketch]:
         yield "power", partial(power, analysis)
 
 
-def _points(
-    axes: Axes,
-    x: FloatArray,
-    y: FloatArray,
-    rows: BoolArray,
-    mark: str,
-    *,
-    linked: bool = True,
-    **style: Any,
-) -> None:
-    """Draw points with the table rows they stand for, if the table is on the page."""
-    at = np.flatnonzero(rows & np.isfinite(x) & np.isfinite(y))
-    (line,) = axes.plot(x[at], y[at], mark, ls="none", **style)
-    if linked and at.size <= MOST_POINTS:
-        line.set_gid("rows-" + "_".join(map(str, at)))
-    elif at.size > MOST_POINTS:
-        line.set_rasterized(True)
+# ---- The field -----------------------------------------------------------------------------------
 
 
 def overview(analysis: Analysis, table: pd.DataFrame) -> Figure:
     """Draw the field of view with its events numbered."""
     image = np.asarray(analysis.ratio_image, float)
-    rows, columns = image.shape
-    figure, axes, per_inch = field_axes((rows, columns))
-    low, high = display_range([image], analysis.scheme)
     # Matplotlib leaves the pixels of small images to the browser, and averages those of large ones.
-    interpolation = "none" if max(rows, columns) <= LARGEST_FIELD else "antialiased"
-    shown = axes.imshow(
-        image,
-        cmap="gray",
-        vmin=low,
-        vmax=high,
-        interpolation=interpolation,
-        aspect=per_inch[0] / per_inch[1],
+    how = "none" if max(image.shape) <= 640 else "antialiased"
+    figure, axes, shown, per_inch = field_figure(
+        image, analysis.scheme, analysis.pixel_size_nm, interpolation=how
     )
-    scale_bar(axes, columns, rows, analysis.pixel_size_nm)
-    unit = "photoelectrons" if analysis.scheme == "darkfield" else "contrast"
+    unit = analysis.scheme_kind.image_unit
     figure.colorbar(shown, ax=axes, label=unit, fraction=0.05, pad=0.02)
     x, y = table["x_px"].to_numpy(float), table["y_px"].to_numpy(float)
-    _points(axes, x, y, np.isfinite(x), "o", mfc="none", mec="#F0E442", ms=11, mew=1)
+    points(axes, x, y, np.isfinite(x), "o", mfc="none", mec="#F0E442", ms=11, mew=1)
     first = table.drop_duplicates("event")[["event", "x_px", "y_px"]].dropna()
-    _number(axes, first.to_numpy(float), per_inch, (rows, columns))
-    axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xlabel="x [px]", ylabel="y [px]")
+    _number(axes, first.to_numpy(float), np.array(per_inch), image.shape)
     return figure
 
 
-def _number(
-    axes: Axes, events: FloatArray, per_inch: tuple[float, float], shape: tuple[int, int]
-) -> None:
-    """Write each event's number beside its ring, where it covers no other ring and no number.
+def _number(axes: Axes, events: FloatArray, per_inch: FloatArray, shape: tuple[int, ...]) -> None:
+    """Write the numbers of the first events beside their rings, where they cover nothing.
 
     `events` has the rows (number, x, y) [px]; `per_inch` is pixels to an inch along x and y.
     """
-    ring, high = 0.08 * per_inch[0], 0.08 * per_inch[1]
-    wide, tall = 0.065 * per_inch[0], 0.1 * per_inch[1]
-    taken = [(x - ring, y - high, x + ring, y + high) for _, x, y in events]
-    taken.append((0.0, shape[0] * 0.9, shape[1] * 0.35, float(shape[0])))
-    for number, x, y in events[:NUMBERED_EVENTS]:
+    field = np.array(shape[::-1], float)
+    ring = 0.08 * per_inch
+    boxes = [(at - ring, at + ring) for at in events[:, 1:]]
+    boxes.append((field * (0.0, 0.9), field * (0.35, 1.0)))  # of the scale bar
+    for number, *place in events[:100]:
         text = f"{number:.0f}"
-        width = wide * len(text)
-        for left, top in (
-            (x + 1.3 * ring, y - tall / 2),
-            (x - 1.3 * ring - width, y - tall / 2),
-            (x - width / 2, y - 1.3 * high - tall),
-            (x - width / 2, y + 1.3 * high),
-        ):
-            box = (left, top, left + width, top + tall)
-            inside = left > 0 and top > 0 and box[2] < shape[1] and box[3] < shape[0]
-            if inside and not any(
-                box[0] < other[2] and box[2] > other[0] and box[1] < other[3] and box[3] > other[1]
-                for other in taken
-            ):
-                taken.append(box)
+        half = per_inch * (0.065 * len(text), 0.1) / 2
+        for side in ((1, 0), (-1, 0), (0, -1), (0, 1)):
+            middle = place + np.array(side) * (1.3 * ring + half)
+            low, high = middle - half, middle + half
+            free = all((high <= first).any() or (low >= last).any() for first, last in boxes)
+            if free and (low > 0).all() and (high < field).all():
+                boxes.append((low, high))
                 axes.text(
-                    left + width / 2, top + tall / 2, text, color="white", fontsize=7,
-                    ha="center", va="center", in_layout=False, path_effects=HALO,
+                    middle[0], middle[1], text, color="white", fontsize=7, ha="center", va="center",
+                    in_layout=False, path_effects=HALO,
                 )  # fmt: skip
                 break
 
 
-def power(analysis: Analysis) -> Figure:
-    """Draw the laser power of each frame used."""
-    figure = new_figure(7.0, 2.3)
-    axes = figure.add_subplot()
-    axes.axhline(1.0, color=GREY, lw=0.8, ls="--")
-    axes.plot(analysis.power_frames, analysis.power, color=BLUE, lw=0.8)
-    axes.set(xlabel="frame", ylabel="laser power, relative")
-    axes.locator_params(axis="y", nbins=5)
-    return figure
-
-
-def _main_values(analysis: Analysis, table: pd.DataFrame) -> tuple[FloatArray, FloatArray, str]:
-    """Give the main quantity of every row, its σ, and the label of its axis."""
-    main = main_quantity(analysis)
-    values = table[main.column].to_numpy(float)
-    if f"sigma_{main.column}" in table:
-        sigma = table[f"sigma_{main.column}"].to_numpy(float)
-    else:
-        sigma = as_contrasts(table.assign(contrast=values))["sigma_mass_kda"].to_numpy(float)
-    return values, sigma, f"{main.label} [{main.unit}]" if main.unit else main.label
+# ---- The main quantity ---------------------------------------------------------------------------
 
 
 def histogram(analysis: Analysis, table: pd.DataFrame) -> Figure:
     """Draw the histogram of the main quantity: mass, contrast or height."""
-    table = counted(table)
-    values, sigma, label = _main_values(analysis, table)
+    table, main = counted(table), main_quantity(analysis)
+    values, sigma = main.values(table)
     finite, good = np.isfinite(values), _is_ok(table)
     bins = histogram_bins(float(np.ptp(values[finite])), sigma[good & np.isfinite(sigma)])
     edges = np.histogram_bin_edges(values[finite], bins=bins)
     figure = new_figure(6.2, 3.2)
     axes = figure.add_subplot()
     ok, every = (np.histogram(values[part], bins=edges)[0] for part in (finite & good, finite))
-    axes.stairs(ok, edges, fill=True, color=BLUE, label="ok")
+    _stacked(axes, edges, ok, every - ok, PURPLE)
     if (every > ok).any():
-        axes.stairs(every, edges, baseline=ok, fill=True, color=PURPLE, label="flagged")
-        figure.legend(loc="outside upper right", ncols=2)
-    axes.set(xlabel=label, ylabel="events")
-    axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
+        legend(figure)
+    _count_events(axes, main.axis)
     return figure
+
+
+def _stacked(axes: Axes, edges: Any, ok: FloatArray, flagged: FloatArray, color: str) -> None:
+    """Draw numbers of events that are ok, and of others above them."""
+    axes.stairs(ok, edges, fill=True, color=BLUE, label="ok" if flagged.any() else None)
+    if flagged.any():
+        style: Style = {"fill": True, "color": color, "label": "flagged"}
+        axes.stairs(ok + flagged, edges, baseline=ok, **style)
+
+
+def histogram_bins(extent: float, spread: FloatArray) -> int:
+    """Count bins of two standard deviations, which do not blur neighbouring species."""
+    width = 2 * float(np.median(spread)) if spread.size else 0.0
+    return int(np.clip(extent / width, 10, 90)) if width > 0 else 10
 
 
 def timeline(analysis: Analysis, table: pd.DataFrame) -> Figure:
     """Draw the main quantity against the frame."""
-    values, _, label = _main_values(analysis, table)
+    main = main_quantity(analysis)
+    values = table[main.column].to_numpy(float)
     spans = analysis.summary.get("landing", {}).get("partly_searched", ())
     figure = new_figure(6.2, 3.3 if spans else 2.8)
     if not spans:
@@ -193,11 +175,11 @@ def timeline(analysis: Analysis, table: pd.DataFrame) -> Figure:
             below.fill_between((start, stop), 100 * (1 - share), color=VERMILLION, lw=0)
         below.set(ylim=(0, 100), ylabel="hidden [%]", xlabel="frame")
     frames, good = table["frame"].to_numpy(float), _is_ok(table)
-    _points(axes, frames, values, good, "o", color=BLUE, ms=3.5, alpha=0.8, mew=0, label="ok")
+    points(axes, frames, values, good, "o", color=BLUE, ms=3.5, alpha=0.8, mew=0, label="ok")
     if not good.all():
-        _points(axes, frames, values, ~good, "x", color=PURPLE, ms=4, label="flagged")
-        figure.legend(loc="outside upper right", ncols=2)
-    axes.set(xlabel="" if spans else "frame", ylabel=label)
+        points(axes, frames, values, ~good, "x", color=PURPLE, ms=4, label="flagged")
+        legend(figure)
+    axes.set(xlabel="" if spans else "frame", ylabel=main.axis)
     axes.xaxis.set_major_locator(MaxNLocator(7, integer=True))
     return figure
 
@@ -206,96 +188,39 @@ def _is_ok(table: pd.DataFrame) -> BoolArray:
     return np.asarray(table["status"] == Status.OK.value, dtype=bool)
 
 
+# ---- Precision -----------------------------------------------------------------------------------
+
+
 def precision(analysis: Analysis, table: pd.DataFrame) -> Figure:
     """Draw each event's σ and QCRB against its CRB, for every free parameter."""
-    free = free_parameters(analysis.mode, table)
-    figure = new_figure(3.0 * len(free), 3.4)
-    good = _is_ok(table)
-    for column, name in enumerate(free):
-        axes = figure.add_subplot(1, len(free), column + 1)
+    free, good = free_parameters(analysis.mode, table), _is_ok(table)
+    figure, panels = row_of_panels(len(free), 3.0, 3.4)
+    panels[0].set_ylabel("σ and QCRB")
+    linked = analysis.tracks is None
+    for axes, name in zip(panels, free, strict=True):
         sigma, crb, qcrb = (
             table[f"{kind}_{name}"].to_numpy(float) for kind in ("sigma", "crb", "qcrb")
         )
         usable = np.isfinite(crb) & (crb > 0)
         axes.set(title=label_of(analysis, name), xlabel=f"CRB [{UNITS[name]}]")
-        if column == 0:
-            axes.set_ylabel("σ and QCRB")
         if not usable.any():
             axes.text(0.5, 0.5, "no bound", ha="center", va="center", transform=axes.transAxes)
             continue
         ends = np.array([crb[usable].min() / 1.15, crb[usable].max() * 1.15])
         axes.plot(ends, ends, color=INK, lw=1.2, label="CRB")
-        style: dict[str, Any] = {
-            "ms": 3.5, "alpha": 0.7, "mew": 0, "linked": analysis.tracks is None
-        }  # fmt: skip
-        _points(axes, crb, qcrb, usable, "s", color=BLUE, label="QCRB", **style)
-        _points(axes, crb, sigma, usable & good, "o", color=VERMILLION, label="σ", **style)
-        if (usable & ~good).any():
-            _points(axes, crb, sigma, usable & ~good, "x", color=PURPLE, label="σ, flagged",
-                    linked=analysis.tracks is None, ms=4)  # fmt: skip
-        axes.set(xscale="log", yscale="log", xlim=tuple(ends))
-        _plain_log_ticks(axes)
-    named = {
-        text: mark
-        for axes in figure.axes
-        for mark, text in zip(*axes.get_legend_handles_labels(), strict=True)
-    }
-    if named:
-        figure.legend(named.values(), named.keys(), loc="outside upper right", ncols=4, fontsize=8)
+        dots: Style = {"linked": linked, "ms": 3.5, "alpha": 0.7, "mew": 0}
+        points(axes, crb, qcrb, usable, "s", color=BLUE, label="QCRB", **dots)
+        points(axes, crb, sigma, usable & good, "o", color=VERMILLION, label="σ", **dots)
+        if (bad := usable & ~good).any():
+            cross: Style = {"linked": linked, "ms": 4, "color": PURPLE, "label": "σ, flagged"}
+            points(axes, crb, sigma, bad, "x", **cross)
+        axes.set_xlim(*ends)
+        plain_log(axes, "x", "y")
+    legend(figure)
     return figure
 
 
-def diagnostics(analysis: Analysis, table: pd.DataFrame) -> Figure | None:
-    """Draw the tests of model and noise."""
-    columns = [table[name].to_numpy(float) for name in ("chi2_reduced", "p_value")]
-    chi2, p_value = (values[np.isfinite(values)] for values in columns)
-    noise = analysis.summary.get("landing") or analysis.summary.get("background") or {}
-    has_noise = len(noise.get("noise_frames", ())) > 1
-    count = int(chi2.size > 1) + int(p_value.size > 1) + int(has_noise)
-    if not count:
-        return None
-    figure = new_figure(3.2 * count, 2.7)
-    panels = iter(np.atleast_1d(figure.subplots(1, count)))
-    for values, label, window in ((chi2, "reduced χ²", None), (p_value, "p-value", (0.0, 1.0))):
-        if values.size > 1:
-            axes = next(panels)
-            bins = 20 if window else int(np.clip(np.sqrt(values.size), 8, 40))
-            axes.hist(values, bins=bins, range=window, color=GREY)
-            if window:
-                axes.axhline(values.size / bins, color=INK, lw=1, ls="--")
-            else:
-                axes.axvline(1.0, color=INK, lw=1, ls="--")
-            axes.set(xlabel=label, ylabel="events")
-            axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-    if has_noise:
-        axes = next(panels)
-        axes.axhline(1.0, color=INK, lw=1, ls="--")
-        over_shot = np.array(noise["noise_variance_over_shot"], dtype=float)
-        axes.plot(noise["noise_frames"], over_shot, "o", color=VERMILLION, ms=4)
-        axes.set(xscale="log", xlabel="frames averaged", ylabel="variance over shot noise")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=6))
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.xaxis.set_minor_locator(NullLocator())
-    return figure
-
-
-def histogram_bins(extent: float, spread: FloatArray) -> int:
-    """Count bins of two standard deviations, which do not blur neighbouring species."""
-    width = 2 * float(np.median(spread)) if spread.size else 0.0
-    return int(np.clip(extent / width, 10, 90)) if width > 0 else 10
-
-
-def _plain_log_ticks(axes: Axes) -> None:
-    """Label a log axis with plain numbers, few enough not to collide."""
-    for axis in (axes.xaxis, axes.yaxis):
-        low, high = axis.get_view_interval()
-        narrow = high / low < 6
-        axis.set_major_locator(MaxNLocator(4) if narrow else LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_locator(NullLocator())
-
-
-def spread_figure(analysis: Analysis, label_of: Callable[[Analysis, str], str]) -> Figure | None:
+def spread(analysis: Analysis) -> Figure | None:
     """Draw the measured spread over the bound against the frames averaged.
 
     In mode ``track``, where none are, against the frames since the background.
@@ -308,19 +233,16 @@ def spread_figure(analysis: Analysis, label_of: Callable[[Analysis, str], str]) 
     if not found:
         return None
     window = float(np.median(counted(analysis.table)["n_after"]))
-    figure = new_figure(3.0 * len(found), 3.0)
-    for column, (name, part) in enumerate(found.items()):
-        axes = figure.add_subplot(1, len(found), column + 1)
+    figure, panels = row_of_panels(len(found), 3.0, 3.0)
+    panels[0].set_ylabel("spread over CRB")
+    for axes, (name, part) in zip(panels, found.items(), strict=True):
         axes.axhline(1.0, color=INK, lw=1)
-        if analysis.mode == "track":
+        if analysis.mode_kind.follows_tracks:
             _draw_frames(axes, part)
         else:
             _draw_windows(axes, part, window)
         axes.set_title(label_of(analysis, name))
-        if column == 0:
-            axes.set_ylabel("spread over CRB")
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper right", ncols=3, fontsize=8)
+    legend(figure)
     return figure
 
 
@@ -330,15 +252,11 @@ def _draw_windows(axes: Axes, part: Mapping[str, Any], window: float) -> None:
     if part["empty_over_crb"]:
         lengths = window * np.array([1 / 8, 1 / 4, 1 / 2, 1])
         axes.plot(lengths, part["empty_over_crb"][1:], "s", color=GREY, ms=4, label="no particle")
-    ratio, (low, high) = part["repeat_over_crb"], part["repeat_over_crb_ci95"]
-    axes.errorbar(
-        [window], [ratio], [[ratio - low], [high - ratio]], fmt="D", color=VERMILLION, ms=5,
-        lw=1.2, label="estimates",
-    )  # fmt: skip
-    axes.set(xscale="log", xlabel="frames averaged")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=6))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_locator(NullLocator())
+    ends = np.array(part["repeat_over_crb_ci95"])[:, None]
+    mark: Style = {"fmt": "D", "color": VERMILLION, "ms": 5, "label": "estimates"}
+    whiskers(axes, [window], [part["repeat_over_crb"]], ends, **mark)
+    plain_log(axes, "x")
+    axes.set_xlabel("frames averaged")
 
 
 def _draw_frames(axes: Axes, part: Mapping[str, Any]) -> None:
@@ -351,7 +269,258 @@ def _draw_frames(axes: Axes, part: Mapping[str, Any]) -> None:
 
 
 def _draw_curve(axes: Axes, part: Mapping[str, Any], mark: str, color: str, label: str) -> None:
-    axes.errorbar(
-        part["repeat_frames"], part["repeat_over_crb_by_frames"],
-        part["repeat_over_crb_by_frames_se"], fmt=mark, color=color, ms=3.5, lw=1, label=label,
-    )  # fmt: skip
+    spread, error = (floats(part[f"repeat_over_crb_by_frames{end}"]) for end in ("", "_se"))
+    style: Style = {"fmt": mark, "color": color, "label": label, "ms": 3.5}
+    whiskers(axes, part["repeat_frames"], spread, around(spread, error), **style)
+
+
+def budget(analysis: Analysis) -> Figure | None:
+    """Draw a bar for each source of the error of a mass, the largest first."""
+    known = [one for one in analysis.summary.get("budget", ()) if one["sigma_rel"]]
+    known = sorted(known, key=lambda one: -one["sigma_rel"])
+    known = [one for one in known if one["sigma_rel"] > 1e-3 * known[0]["sigma_rel"]]
+    if not known:
+        return None
+    figure = new_figure(6.5, 0.7 + 0.3 * len(known))
+    axes = figure.add_subplot()
+    colors = {"measured": BLUE, "learned": VERMILLION, "assumed": GREY}
+    for place, one in enumerate(known):
+        long, alpha = 100 * one["sigma_rel"], 1.0 if one["common"] else 0.5
+        axes.barh(place, long, height=0.6, color=colors[one["kind"]], alpha=alpha)
+        text = f" {one['kind']}{'' if one['common'] else ', each row its own'}"
+        axes.annotate(text, (long, place), va="center", fontsize=8, color=INK)
+    axes.set_yticks(range(len(known)), [fill(one["name"], 34) for one in known])
+    axes.invert_yaxis()
+    axes.set_xlim(0, 170 * known[0]["sigma_rel"])
+    axes.set_xlabel("standard deviation over the mass [%]")
+    return figure
+
+
+def diagnostics(analysis: Analysis, table: pd.DataFrame) -> Figure | None:
+    """Draw the tests of model and noise."""
+    columns = [table[name].to_numpy(float) for name in ("chi2_reduced", "p_value")]
+    chi2, p_value = (values[np.isfinite(values)] for values in columns)
+    noise = analysis.summary.get("landing") or analysis.summary.get("background") or {}
+    drawn: list[Callable[[Axes], None]] = []
+    if chi2.size > 1:
+        drawn.append(partial(_draw_chi2, chi2))
+    if p_value.size > 1:
+        drawn.append(partial(_draw_p_values, p_value))
+    if len(noise.get("noise_frames", ())) > 1:
+        drawn.append(partial(_draw_noise, noise))
+    if not drawn:
+        return None
+    figure, panels = row_of_panels(len(drawn), 3.2, 2.7)
+    for axes, draw_panel in zip(panels, drawn, strict=True):
+        draw_panel(axes)
+    return figure
+
+
+def _draw_chi2(chi2: FloatArray, axes: Axes) -> None:
+    axes.hist(chi2, bins=int(np.clip(np.sqrt(chi2.size), 8, 40)), color=GREY)
+    axes.axvline(1.0, color=INK, lw=1, ls="--")
+    _count_events(axes, "reduced χ²")
+
+
+def _draw_p_values(p_values: FloatArray, axes: Axes) -> None:
+    axes.hist(p_values, bins=20, range=(0.0, 1.0), color=GREY)
+    axes.axhline(p_values.size / 20, color=INK, lw=1, ls="--")
+    _count_events(axes, "p-value")
+
+
+def _count_events(axes: Axes, against: str) -> None:
+    axes.set(xlabel=against, ylabel="events")
+    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+
+
+def _draw_noise(noise: Mapping[str, Any], axes: Axes) -> None:
+    axes.axhline(1.0, color=INK, lw=1, ls="--")
+    over_shot = floats(noise["noise_variance_over_shot"])
+    axes.plot(noise["noise_frames"], over_shot, "o", color=VERMILLION, ms=4)
+    plain_log(axes, "x")
+    axes.set(xlabel="frames averaged", ylabel="variance over shot noise")
+
+
+# ---- Where in the movie? -------------------------------------------------------------------------
+
+
+def power(analysis: Analysis) -> Figure:
+    """Draw the laser power of each frame used."""
+    figure = new_figure(7.0, 2.3)
+    axes = figure.add_subplot()
+    _draw_light(analysis, axes)
+    axes.set(xlabel="frame", ylabel="laser power, relative")
+    axes.locator_params(axis="y", nbins=5)
+    return figure
+
+
+def _draw_light(analysis: Analysis, axes: Axes) -> None:
+    axes.axhline(1.0, color=GREY, lw=0.8, ls="--")
+    axes.plot(analysis.power_frames, analysis.power, color=BLUE, lw=0.8)
+
+
+def movie_figure(analysis: Analysis) -> Figure:
+    """Draw light, noise, focus, drift and events of a movie, on one axis of frames."""
+    course = analysis.summary["timeline"]
+    rows = _rows(analysis, course)
+    figure = new_figure(7.0, 0.75 + 0.72 * len(rows))
+    panels = np.atleast_1d(figure.subplots(len(rows), 1, sharex=True))
+    edges = course["events"]["edges"]
+    narrow = 0.004 * (edges[-1] - edges[0])  # the least that is seen of an interval
+    for axes, (label, draw_row) in zip(panels, rows.items(), strict=True):
+        draw_row(axes)
+        for one in course["intervals"]:
+            hidden = one["what"].startswith("partly")
+            ends = one["start"], max(one["stop"], one["start"] + narrow)
+            name, color, alpha = (
+                ("partly hidden", GREY, 0.2) if hidden else ("left out", PURPLE, 0.3)
+            )
+            axes.axvspan(*ends, lw=0, color=color, alpha=alpha, label=name)
+        axes.set_ylabel(label, rotation=0, ha="right", va="center")
+        # 0.7 inches of room for the numbers beside a row: to measure it takes half of drawing
+        beside = ScaledTranslation(-0.7, 0, figure.dpi_scale_trans)
+        axes.yaxis.set_label_coords(0, 0.5, transform=axes.transAxes + beside)
+        axes.yaxis.set_major_locator(MaxNLocator(3))
+    panels[-1].yaxis.set_major_locator(MaxNLocator(3, integer=True))
+    panels[-1].set(xlabel="frame", xlim=(edges[0], edges[-1]))
+    panels[-1].xaxis.set_major_locator(MaxNLocator(7, integer=True))
+    legend(figure)
+    return figure
+
+
+def _rows(analysis: Analysis, course: Mapping[str, Any]) -> dict[str, Callable[[Axes], None]]:
+    """Name the rows that have something to show, and what draws each."""
+    frames, noise, focus, x, y = (
+        floats(course[name])
+        for name in ("frames", "noise_over_expected", "focus_nm", "drift_x_px", "drift_y_px")
+    )
+
+    def noise_row(axes: Axes) -> None:
+        axes.axhline(1.0, color=GREY, lw=0.8, ls="--")
+        axes.plot(frames, noise, "o", color=VERMILLION, ms=2.5)
+        low, high = axes.get_ylim()
+        axes.set_ylim(min(low, 0.95), max(high, 1.05))
+
+    def focus_row(axes: Axes) -> None:
+        axes.plot(frames, focus, color=BLUE, lw=1.2)
+        low, high = axes.get_ylim()
+        if high - low < 1.0:  # of a focus that stays
+            axes.set_ylim(low - 1.0, high + 1.0)
+
+    def drift(axes: Axes) -> None:
+        axes.plot(frames, x, color=BLUE, lw=1.2, label="x")
+        axes.plot(frames, y, color=VERMILLION, lw=1.2, label="y")
+
+    def events(axes: Axes) -> None:
+        ok, flagged = (np.array(course["events"][name]) for name in ("ok", "flagged"))
+        _stacked(axes, course["events"]["edges"], ok, flagged, VERMILLION)
+
+    has_focus = analysis.scheme_kind.interferes and np.isfinite(focus).any()
+    rows = (
+        (np.isfinite(analysis.power).any(), "light,\nrelative", partial(_draw_light, analysis)),
+        (np.isfinite(noise).any(), "noise,\nvariance over\nexpected", noise_row),
+        (has_focus, "focus\n[nm]", focus_row),
+        (np.isfinite(x).any(), "drift\n[px]", drift),
+        (True, "events", events),
+    )
+    return {label: draw_row for shown, label, draw_row in rows if shown}
+
+
+# ---- One at a time, for a notebook ---------------------------------------------------------------
+
+
+def draw(analysis: Analysis, kind: str) -> Figure:
+    """Draw one figure of the whole analysis."""
+    table = event_table(analysis)
+    tracked = analysis.tracks is not None
+    kinds: dict[str, Callable[[], Figure]] = {
+        "overview": partial(track_figures.trajectories if tracked else overview, analysis, table),
+        "histogram": partial(track_figures.distributions, analysis)
+        if tracked
+        else partial(histogram, analysis, table),
+        "precision": partial(precision, analysis, table),
+        "power": partial(power, analysis),
+    }
+    if kind not in kinds:
+        raise ValueError(f"kind = {kind!r}: choose one of {', '.join(kinds)}")
+    main = table[main_quantity(analysis).column].to_numpy(float)
+    if kind in ("histogram", "precision") and not np.isfinite(main).any():
+        raise DataError(f"{_movie(analysis)}: no event was found, so there is no {kind} to draw")
+    return _shown(kinds[kind])
+
+
+def draw_view(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:
+    """Draw data, model and residual of one event."""
+    return _shown(partial(event_figures.triptych, view, scheme, pixel_size_nm))
+
+
+def draw_corner(analysis: Analysis, event: int) -> Figure:
+    """Draw the posterior of one event: each parameter, and each pair."""
+    return _shown(partial(event_figures.corner, posterior_of(analysis, event), event))
+
+
+def view_of(analysis: Analysis, event: int) -> EventView:
+    """Find the images of one event."""
+    if isinstance(event, bool) or not isinstance(event, (int, np.integer)):
+        raise ConfigError(f"event = {event!r}: events have whole numbers, as in view(0)")
+    for view in analysis.views:
+        if view.event == event:
+            return view
+    known = [view.event for view in analysis.views]
+    held = f"it has events {min(known)} to {max(known)}" if known else "no event was found"
+    raise DataError(f"{_movie(analysis)}: there is no event {event}; {held}")
+
+
+def posterior_of(analysis: Analysis, event: int) -> PosteriorResult:
+    """Find the converged chain of one event."""
+    posterior = view_of(analysis, event).posterior
+    if posterior is None:
+        status = analysis.table.loc[analysis.table["event"] == event, "status"].iloc[0]
+        why = "" if status == Status.OK else f" (its fit is {status})"
+        raise DataError(
+            f"{_movie(analysis)}: the posterior of event {event} was not sampled{why}; "
+            "fit again with posterior.enabled = true"
+        )
+    if not posterior.converged:
+        raise DataError(
+            f"{_movie(analysis)}: the chain of event {event} has not converged "
+            f"({posterior.message}), so it is not a posterior; raise posterior.steps"
+        )
+    return posterior
+
+
+def event_facts(row: pd.Series[Any]) -> list[tuple[str, str]]:
+    """Say in words what was found of an event: its numbers, with errors and bounds."""
+    name, number = "event", row["event"]
+    if "track" in row and pd.notna(row["track"]):
+        name, number = "track", int(row["track"])
+    when = "leaves at frame" if row["mass_kda"] < 0 else "frame"
+    facts = [(name, f"{number}, {when} {row['frame']}")]
+    for key in (PARAMETERS[-1], *PARAMETERS[:-1]):
+        if not np.isfinite(row[key]):
+            continue
+        sigma, bound = row[f"sigma_{key}"], row[f"crb_{key}"]
+        error = f" ± {sigma:.1f}" if np.isfinite(sigma) else ""
+        beside = f" (CRB {bound:.1f})" if np.isfinite(bound) else ""
+        facts.append((LABELS[key], f"{row[key]:.1f}{error} {UNITS[key]}{beside}"))
+    status = Status(row["status"])
+    facts.append(("contrast", f"{100 * row['contrast']:.3f} %, SNR {row['snr']:.1f}"))
+    return [*facts, ("status", f"{status.value}: {status.advice}")]
+
+
+def _movie(analysis: Analysis) -> str:
+    return analysis.provenance.input_path or "the movie"
+
+
+def _shown(make: Callable[[], Figure]) -> Figure:
+    """Draw a figure that a notebook can ask for its picture, without pyplot and its state."""
+    with mpl.rc_context(STYLE):
+        figure = make()
+    setattr(figure, "_repr_png_", partial(_png, figure))  # noqa: B010
+    return figure
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=100)
+    return buffer.getvalue()

@@ -20,6 +20,7 @@ from filelock import FileLock, Timeout
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.files import remove_folder, take, unfinished
+from iscat_analysis.reading import is_file, is_folder
 
 FILE_LIST = ".iscat-files"
 """The list of files in every output folder: a first line, then a path in each, as JSON."""
@@ -40,6 +41,12 @@ OUTPUT_NAMES = frozenset(
     }
 )
 """Everything `write_report` may leave in its folder."""
+
+PAGES = (
+    "report.html", "batch.html", "camera.html", "calibration.html", "optics.html", "template.html",
+    "benchmark.html", "challenge.html", "comparison.html",
+)  # fmt: skip
+"""Pages that the commands write."""
 
 _HEADING = "Files of iscat-analysis; what is not in this list is never removed."
 _SIGNED = "lock of iscat-analysis, process "
@@ -344,3 +351,27 @@ def _swap(building: Path, target: Path) -> None:
             kept.rename(target)
         if target.exists():
             _remove_earlier(earlier, kept)
+
+
+# ---- The page of a result ------------------------------------------------------------------------
+
+
+def page_of(result: Path) -> Path:
+    """Find the page of a result."""
+    if result.suffix.lower() in (".html", ".htm") and is_file(result):
+        return result
+    folder = result.with_suffix(".iscat") if is_file(result) else result
+    found = [folder / name for name in PAGES if is_file(folder / name)]
+    if found:
+        return found[0]
+    if is_folder(folder):
+        raise DataError(
+            f"{folder}: holds no page ({', '.join(PAGES)}); give the output folder of iscat fit, "
+            "batch, calibrate or benchmark"
+        )
+    if is_file(result):
+        raise DataError(
+            f"{result}: has no result beside it ({folder.name}); analyse it with iscat fit, or "
+            "give the folder of its result"
+        )
+    raise DataError(f"{result}: there is no such folder; check the path")

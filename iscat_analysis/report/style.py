@@ -1,10 +1,10 @@
-"""How figures look, in files and inside a page."""
+"""How figures look, in files and inside a page, and the parts that many of them have."""
 
 from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +14,23 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.image import AxesImage
+from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from PIL import Image
 
-DPI = 140
-"""Resolution of the PNG files."""
+from iscat_analysis.config import SCHEMES
+from iscat_analysis.records import BoolArray, FloatArray
 
-PRINT_DPI = 300
-"""The same of figures that have the size of print."""
+DPI, PRINT_DPI = 140, 300
+"""Resolution of the PNG files, and of those whose figures have the size of print."""
 
 VERMILLION, BLUE, PURPLE, GREY, INK = "#D55E00", "#0072B2", "#CC79A7", "#8A8F96", "#1B1D21"
 GRID = "#E7E4DD"
+
+HALO = [withStroke(linewidth=1.6, foreground="black", alpha=0.7)]
+"""Makes white text readable on any image."""
 
 _THEME = {
     INK: "ink",
@@ -68,6 +74,9 @@ def new_figure(width: float, height: float, *, constrained: bool = True) -> Figu
     FigureCanvasAgg(figure)
     return figure
 
+
+Style = dict[str, Any]
+"""How something is drawn: arguments of Matplotlib's."""
 
 Sketch = tuple[str, Callable[[], Figure | None]]
 """Name of a figure, and what draws it; nothing where there is nothing to show."""
@@ -149,13 +158,147 @@ def inline_svg(svg: str, name: str) -> Markup:
     return Markup(svg)  # Matplotlib escapes every text
 
 
-def log_y(axes: Axes) -> None:
-    """Set a logarithmic y axis with plain numbers."""
-    axes.set_yscale("log")
-    low, high = axes.get_ylim()
-    steps = {200.0: (1.0,), 20.0: (1.0, 2.0, 5.0), 4.0: (1.0, 2.0, 3.0, 5.0, 7.0)}
-    finest = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
-    subs = next((subs for span, subs in steps.items() if high / low > span), finest)
-    axes.yaxis.set_major_locator(LogLocator(subs=subs))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
+# ---- Parts of figures ----------------------------------------------------------------------------
+
+
+def floats(values: Iterable[float | None]) -> FloatArray:
+    """Make an array of numbers of a JSON document, NaN for null."""
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def row_of_panels(number: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """Make a figure of panels side by side, each of this size."""
+    figure = new_figure(width * number, height)
+    return figure, list(figure.subplots(1, number, squeeze=False)[0])
+
+
+def plain_log(axes: Axes, *which: str) -> None:
+    """Make axes logarithmic, with plain numbers beside them, few enough not to collide."""
+    for name in which:
+        axes.set(**{f"{name}scale": "log"})
+        axis = axes.xaxis if name == "x" else axes.yaxis
+        low, high = axis.get_view_interval()
+        subs = (1.0,) if high / low > 200 else (1.0, 2.0, 5.0)
+        axis.set_major_locator(MaxNLocator(4) if high / low < 6 else LogLocator(subs=subs))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
+
+
+def legend(figure: Figure, *, where: str = "upper right", columns: int = 4) -> None:
+    """Write one legend outside the panels, each label once."""
+    known: dict[str, Any] = {
+        label: handle
+        for axes in figure.axes
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    if known:
+        place: Any = f"outside {where}"
+        figure.legend(known.values(), known.keys(), loc=place, ncols=columns, fontsize=8)
+
+
+def points(
+    axes: Axes,
+    x: FloatArray,
+    y: FloatArray,
+    rows: BoolArray,
+    mark: str = "o",
+    *,
+    linked: bool = True,
+    **style: Any,
+) -> None:
+    """Draw points that know the rows of the page's table that they stand for.
+
+    Of more than 800 the page has an image; where the table is of something else they are not
+    `linked`.
+    """
+    at = np.flatnonzero(rows & np.isfinite(x) & np.isfinite(y))
+    (line,) = axes.plot(x[at], y[at], mark, ls="none", **style)
+    if at.size > 800:
+        line.set_rasterized(True)
+    elif linked:
+        line.set_gid("rows-" + "_".join(map(str, at)))
+
+
+def whiskers(
+    axes: Axes, at: Any, values: Any, ends: Any, *, along: str = "y", **style: Any
+) -> None:
+    """Draw values with their intervals along an axis; `ends` are all lower and all upper ends."""
+    values = np.asarray(values, dtype=float)
+    low, high = np.asarray(ends, dtype=float)
+    reach = np.nan_to_num(np.maximum([values - low, high - values], 0.0))
+    x, y = (at, values) if along == "y" else (values, at)
+    how: Style = {"fmt": "o", "ms": 4, "lw": 1, f"{along}err": reach, **style}
+    axes.errorbar(x, y, **how)
+
+
+def around(values: Any, reach: Any) -> tuple[FloatArray, FloatArray]:
+    """Give the ends of intervals of this half length."""
+    middle, half = np.asarray(values, dtype=float), np.asarray(reach, dtype=float)
+    return middle - half, middle + half
+
+
+def picture(
+    axes: Axes, image: Any, half: float, limits: tuple[float, float], title: str, **style: Any
+) -> None:
+    """Draw an image whose half side is `half`, with its scale."""
+    low, high = limits
+    extent = (-half, half, half, -half)
+    shown = axes.imshow(image, vmin=low, vmax=high, extent=extent, **{"cmap": "RdBu_r", **style})
+    axes.set_title(title)
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    figure.colorbar(shown, ax=axes, shrink=0.8)
+
+
+def display_range(images: Sequence[Any], scheme: str) -> tuple[float, float]:
+    """Choose the grey scale that images share."""
+    values = np.concatenate([np.ravel(image) for image in images])
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return -1.0, 1.0
+    if not SCHEMES[scheme].interferes:
+        low, high = (float(v) for v in np.quantile(values, [0.002, 0.999]))
+        return (low, high) if high > low else (low, low + 1.0)
+    limit = float(np.quantile(np.abs(values), 0.998))
+    return (-limit, limit) if limit > 0 else (-1.0, 1.0)
+
+
+def scale_bar(axes: Axes, columns: int, rows: int, pixel_size_nm: float) -> None:
+    """Draw a scale bar into the lower left corner of an image."""
+    bars = [50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000]
+    length_nm = max([b for b in bars if b <= 0.4 * columns * pixel_size_nm], default=bars[0])
+    x, y = 0.04 * columns - 0.5, 0.955 * rows - 0.5
+    wide, tall = length_nm / pixel_size_nm, 0.012 * rows
+    axes.add_patch(Rectangle((x, y), wide, tall, fc="white", ec="black", lw=0.6, zorder=3))
+    text = f"{length_nm / 1000:g} µm"
+    axes.text(x, y - 0.015 * rows, text, color="white", fontsize=8, path_effects=HALO, zorder=3)
+
+
+def field_figure(
+    image: FloatArray, scheme: str, pixel_size_nm: float, *, bright: float = 1.0, **style: Any
+) -> tuple[Figure, Axes, AxesImage, tuple[float, float]]:
+    """Draw a field of view; give pixels to an inch along x and y too.
+
+    The pixels of a field that is more than five times as long as wide are stretched, because
+    nothing could be recognised otherwise.
+    """
+    rows, columns = image.shape
+    true = rows / columns
+    drawn = float(np.clip(true, 1 / 5, 5))
+    across, tall = 5.2, float(np.clip(5.2 * drawn, 1.0, 7.5))  # inches; the rest is for words
+    figure = new_figure(across + 1.0, tall + 0.5 + (0.0 if drawn == true else 0.25))
+    axes = figure.add_subplot()
+    if drawn != true:
+        stretch = "tall as wide" if drawn > true else "wide as tall"
+        times = max(drawn / true, true / drawn)
+        axes.set_title(f"pixels are drawn {times:.2g} times as {stretch}", fontsize=8)
+    wide = min(across, tall / drawn)
+    per_inch = columns / wide, rows / (wide * drawn)
+    low, high = display_range([image], scheme)
+    shown = axes.imshow(
+        image, cmap="gray", vmin=bright * low, vmax=bright * high,
+        aspect=per_inch[0] / per_inch[1], **style,
+    )  # fmt: skip
+    scale_bar(axes, columns, rows, pixel_size_nm)
+    axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xlabel="x [px]", ylabel="y [px]")
+    return figure, axes, shown, per_inch

@@ -1,15 +1,24 @@
-"""The tables of the output folder: events, summary, configuration."""
+"""What programs read of a result: tables, summary, configuration, and chains for ArviZ."""
 
 from __future__ import annotations
 
+import importlib
+import io
+import json
+from collections.abc import Sequence
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
-from iscat_analysis.records import EVENT_COLUMNS, EVENTS, Analysis
+from iscat_analysis.records import EVENT_COLUMNS, EVENTS, Analysis, EventView
+from iscat_analysis.report.numbers import UNITS
 from iscat_analysis.schemas import to_json
+
+if TYPE_CHECKING:
+    import xarray
 
 CSV_DIGITS = 9
 """Significant digits in ``fits.csv``: 0.1 pm in a field of 100 µm, with no digits of pure noise."""
@@ -38,6 +47,16 @@ def _text(value: Any) -> str:
     return ""
 
 
+def write_csv(table: pd.DataFrame, path: Path, digits: int = CSV_DIGITS) -> None:
+    """Write a table as CSV, with the same bytes on every system."""
+    table.to_csv(path, index=False, float_format=f"%.{digits}g", lineterminator="\n")
+
+
+def write_json(name: str, values: Any, path: Path) -> None:
+    """Write a document through its schema."""
+    path.write_text(to_json(name, values) + "\n", encoding="utf-8")
+
+
 def write_tables(analysis: Analysis, folder: Path) -> None:
     """Write ``fits.csv``, ``tracks.csv`` where there are tracks, both as Parquet, and the rest.
 
@@ -47,21 +66,81 @@ def write_tables(analysis: Analysis, folder: Path) -> None:
     if analysis.tracks is not None:
         tables["tracks"] = analysis.tracks
     for name, table in tables.items():
-        table.to_csv(
-            folder / f"{name}.csv",
-            index=False,
-            float_format=f"%.{CSV_DIGITS}g",
-            lineterminator="\n",
-        )
+        write_csv(table, folder / f"{name}.csv")
         with (folder / f"{name}.parquet").open("wb") as file:  # pyarrow wants paths as text
             table.to_parquet(file, index=False)
     if analysis.response is not None:
-        analysis.response.to_csv(
-            folder / "response.csv",
-            index=False,
-            float_format=f"%.{CSV_DIGITS}g",
-            lineterminator="\n",
-        )
-    summary = to_json("summary", analysis.summary)
-    (folder / "summary.json").write_text(summary + "\n", encoding="utf-8")
+        write_csv(analysis.response, folder / "response.csv")
+    write_json("summary", analysis.summary, folder / "summary.json")
     (folder / "config.toml").write_text(analysis.config_toml, encoding="utf-8")
+
+
+def posterior_groups(analysis: Analysis, views: Sequence[EventView]) -> dict[str, xarray.Dataset]:
+    """Arrange posteriors as ArviZ does, with the events as one more dimension."""
+    import xarray  # takes half a second, and only chains need it
+
+    chains = [view.posterior for view in views if view.posterior is not None]
+    names = chains[0].names
+    n_chain, n_draw = (min(p.samples.shape[axis] for p in chains) for axis in (0, 1))
+    axes = ("chain", "draw", "event")
+    samples = np.stack([p.samples[:n_chain, -n_draw:] for p in chains], axis=2)
+    values = np.stack([p.log_likelihood[:n_chain, -n_draw:] for p in chains], axis=2)
+    coordinates = {
+        "chain": range(n_chain),
+        "draw": range(n_draw),
+        "event": [view.event for view in views],
+    }
+    refused = [
+        (int(view.event), view.posterior.message)
+        for view in analysis.views
+        if view.posterior is not None and not view.posterior.converged
+    ]
+    about = {
+        "sampling_library": "emcee",
+        "input_path": analysis.provenance.input_path,
+        "input_sha256": analysis.provenance.input_sha256,
+        "events_not_converged": json.dumps([event for event, _ in refused]),
+        "reasons_not_converged": json.dumps([message for _, message in refused]),
+        "draws_before_cutting": json.dumps([int(p.samples.shape[1]) for p in chains]),
+    }
+    by_parameter = {
+        name: (("event", "parameter"), np.stack([getattr(p, name) for p in chains]))
+        for name in ("tau", "r_hat", "ess_bulk", "ess_tail")
+    }
+    if all(p.van_trees is not None for p in chains):
+        bounds = np.stack([np.asarray(p.van_trees) for p in chains])
+        by_parameter["van_trees"] = (("event", "parameter"), bounds)
+    statistics = {
+        "log_likelihood": (axes, values),
+        "acceptance": (("event",), np.array([p.acceptance for p in chains])),
+        **by_parameter,
+    }
+    variables = {
+        name: (axes, samples[..., k], {"units": UNITS[name]}) for k, name in enumerate(names)
+    }
+    by_name = {**coordinates, "parameter": list(names)}
+    return {
+        "posterior": xarray.Dataset(variables, coordinates, about),
+        "sample_stats": xarray.Dataset(statistics, by_name, about),
+    }
+
+
+def write_posterior(analysis: Analysis, path: Path) -> bool:
+    """Write the converged posteriors as one ArviZ InferenceData file.
+
+    ``arviz.from_netcdf(path).posterior["mass_kda"].sel(event=7)`` is one event's chain.  Events
+    whose chains did not converge are left out and named in the attributes.
+    """
+    usable = [v for v in analysis.views if v.posterior is not None and v.posterior.converged]
+    if not usable:
+        return False
+    from xarray.backends import H5NetCDFStore
+
+    h5netcdf: Any = importlib.import_module("h5netcdf")  # it has no types
+    # Made in memory, because libhdf5 crashes instead of failing where the disk is full.
+    buffer = io.BytesIO()
+    with h5netcdf.File(buffer, "w") as file:
+        for name, group in posterior_groups(analysis, usable).items():
+            group.dump_to_store(H5NetCDFStore(file, group=name, mode="a"))
+    path.write_bytes(buffer.getbuffer())
+    return True

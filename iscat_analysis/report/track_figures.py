@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,32 +15,38 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-from numpy.typing import NDArray
 
+from iscat_analysis.config import parse_config
+from iscat_analysis.optics.materials import material
+from iscat_analysis.optics.spheres import Sphere, scattering_length_nm, sphere_of
 from iscat_analysis.records import Analysis, BoolArray, FloatArray, TrackStatus, track_numbers
-from iscat_analysis.report.answer import main_quantity, tracks_of
-from iscat_analysis.report.event_figures import scale_bar
-from iscat_analysis.report.field import field_axes
-from iscat_analysis.report.scales import display_range
-from iscat_analysis.report.size_plane import has_plane, size_plane
-from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, Sketch, new_figure
+from iscat_analysis.report.answer import track_quantity, tracks_of
+from iscat_analysis.report.style import (
+    BLUE,
+    GREY,
+    INK,
+    PURPLE,
+    Sketch,
+    Style,
+    field_figure,
+    legend,
+    new_figure,
+    plain_log,
+    points,
+)
+from iscat_analysis.units import sphere_mass_kda
 
 MOST_TRACKS = 400
-"""Tracks whose points tell their row when the pointer is over them; more become an image."""
-
-MSD_TRACKS = 6
-"""Tracks whose mean-squared displacement is drawn: the longest that are ok."""
+"""Tracks whose errors are drawn beside their points; more would hide them."""
 
 MSD_PART = 4
-"""Longest lag: the track's length over this; beyond, few displacements are left."""
+"""Longest lag of a mean-squared displacement: the track's length over this."""
 
-_MOST_VERTICES = 20_000  # of paths in the page; more become an image
-_CELLS = 120  # of a density, along each axis
+INDICES = (1.36, 1.40, 1.46, 1.52, 1.60)
+"""Refractive indices whose lines are drawn, of spheres that do not absorb."""
+
 _LEAST_WIDTH = 0.012  # of an axis, of a track whose error would not be seen
-_FAR = 3.0  # times the masses of tracks that are ok, up to where the scale of colours goes
 _UM2 = 1e6  # nm²
-_NO_MASS = (0.6, 0.6, 0.6, 1.0)
 
 
 def track_figures(analysis: Analysis, fits: pd.DataFrame) -> Iterator[Sketch]:
@@ -58,26 +66,12 @@ def track_figures(analysis: Analysis, fits: pd.DataFrame) -> Iterator[Sketch]:
 
 
 def masses(analysis: Analysis) -> tuple[FloatArray, FloatArray]:
-    """Give the main quantity of every track, mass or contrast, and its σ.
+    """Give the size of every track, mass or contrast, and its σ.
 
     Shapes: `values, sigma` (tracks,).
     """
-    tracks, column = tracks_of(analysis), main_quantity(analysis).column
-    mass = tracks["mass_kda"].abs().to_numpy(float)
-    sigma = tracks["sigma_mass_kda"].to_numpy(float)
-    if column != "contrast":
-        return mass, sigma
-    size = tracks["contrast"].abs().to_numpy(float)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return size, sigma * size / mass
-
-
-def mass_label(analysis: Analysis) -> str:
-    """Name the axis of masses or contrasts."""
-    main = main_quantity(analysis)
-    if main.column == "contrast":
-        return "|contrast|"
-    return "mass [kDa]" if main.column == "mass_kda" else "mass, model scale [kDa]"
+    values, sigma = track_quantity(analysis).values(tracks_of(analysis))
+    return np.abs(values), sigma
 
 
 def path_colors(analysis: Analysis) -> tuple[Normalize, Colormap, str]:
@@ -92,66 +86,46 @@ def path_colors(analysis: Analysis) -> tuple[Normalize, Colormap, str]:
     if not known.size:
         return Normalize(0.0, 1.0), mpl.colormaps["viridis"], "neither"
     trusted = values[good] if good.any() else known
-    low = max(float(known.min()), float(trusted.min()) / _FAR)
-    high = min(float(known.max()), float(trusted.max()) * _FAR)
+    low = max(float(known.min()), float(trusted.min()) / 3)
+    high = min(float(known.max()), float(trusted.max()) * 3)
     below, above = known.min() < low, known.max() > high
-    beyond = {(True, True): "both", (True, False): "min", (False, True): "max"}
+    beyond = ("both" if above else "min") if below else ("max" if above else "neither")
     if high <= low:
         low, high = 0.9 * low, 1.1 * high or 1.0
-    ends = beyond.get((bool(below), bool(above)), "neither")
-    return Normalize(low, high), mpl.colormaps["viridis"], ends
+    return Normalize(low, high), mpl.colormaps["viridis"], beyond
+
+
+def _shades(analysis: Analysis) -> list[Any]:
+    """Give every track its colour; grey if its mass is not known."""
+    norm, colors, _ = path_colors(analysis)
+    values, _ = masses(analysis)
+    return [colors(norm(size)) if np.isfinite(size) else "0.6" for size in values]
 
 
 def _scale_beside(figure: Figure, axes: Axes, analysis: Analysis) -> None:
     """Draw the scale of masses, with an arrow at an end beyond which some lie."""
     norm, colors, beyond = path_colors(analysis)
-    figure.colorbar(
-        mpl.cm.ScalarMappable(norm, colors), ax=axes, label=mass_label(analysis),
-        fraction=0.05, pad=0.02, extend=beyond,
-    )  # fmt: skip
+    shown, label = mpl.cm.ScalarMappable(norm, colors), track_quantity(analysis).axis
+    figure.colorbar(shown, ax=axes, label=label, fraction=0.05, pad=0.02, extend=beyond)
 
 
 def trajectories(analysis: Analysis, fits: pd.DataFrame) -> Figure:
     """Draw the field with the paths of its particles, coloured by mass."""
     tracks = tracks_of(analysis)
     image = np.asarray(analysis.ratio_image, float)
-    tall, columns = image.shape
-    figure, axes, per_inch = field_axes((tall, columns))
-    low, high = display_range([image], analysis.scheme)
-    axes.imshow(
-        image,
-        cmap="gray",
-        vmin=2 * low,
-        vmax=2 * high,
-        interpolation="antialiased",
-        aspect=per_inch[0] / per_inch[1],
+    figure, axes, _, _ = field_figure(
+        image, analysis.scheme, analysis.pixel_size_nm, bright=2.0, interpolation="antialiased"
     )
-    scale_bar(axes, columns, tall, analysis.pixel_size_nm)
-    norm, colors, _ = path_colors(analysis)
-    values, _ = masses(analysis)
-    numbers = track_numbers(fits)
-    paths = dict(iter(fits.sort_values("frame").groupby(numbers)))
-    lines, shades = [], []
-    for track, size in zip(tracks["track"], values, strict=True):
-        lines.append(paths[track][["x_px", "y_px"]].to_numpy(float))
-        shades.append(colors(norm(size)) if np.isfinite(size) else _NO_MASS)
-    drawn = LineCollection(lines, colors=shades, linewidths=1.1, capstyle="round")
-    drawn.set_rasterized(sum(map(len, lines)) > _MOST_VERTICES)
+    paths = dict(iter(fits.sort_values("frame").groupby(track_numbers(fits))))
+    lines = [paths[track][["x_px", "y_px"]].to_numpy(float) for track in tracks["track"]]
+    drawn = LineCollection(lines, colors=_shades(analysis), linewidths=1.1, capstyle="round")
+    drawn.set_rasterized(sum(map(len, lines)) > 20_000)
     axes.add_collection(drawn)
     starts = np.array([line[0] for line in lines]).reshape(-1, 2)
-    _points(axes, starts[:, 0], starts[:, 1], np.arange(len(tracks)), mfc="none", mec="white", ms=5)
+    every = np.ones(len(tracks), dtype=bool)
+    points(axes, starts[:, 0], starts[:, 1], every, mfc="none", mec="white", ms=5)
     _scale_beside(figure, axes, analysis)
-    axes.set(xlim=(-0.5, columns - 0.5), ylim=(tall - 0.5, -0.5), xlabel="x [px]", ylabel="y [px]")
     return figure
-
-
-def _points(axes: Axes, x: FloatArray, y: FloatArray, rows: NDArray[np.intp], **style: Any) -> None:
-    """Draw points that know the rows of the table of tracks they stand for."""
-    (line,) = axes.plot(x, y, "o", ls="none", **style)
-    if len(rows) <= MOST_TRACKS:
-        line.set_gid("rows-" + "_".join(map(str, rows)))
-    else:
-        line.set_rasterized(True)
 
 
 def mass_d(analysis: Analysis) -> Figure:
@@ -165,31 +139,25 @@ def mass_d(analysis: Analysis) -> Figure:
     axes = figure.add_subplot()
     x_ends, y_ends = _span(mass[usable], sigma[usable]), _log_span(d[usable], d_sigma[usable])
     shown = good if good.any() else usable
-    density = _density(
-        (mass[shown], sigma[shown], np.array(x_ends)),
-        (np.log(d[shown]), d_sigma[shown] / d[shown], np.log(y_ends)),
-    )
+    cells = 120  # along each axis; the outermost have their middles at the ends of the axes
+    x, y = np.linspace(*x_ends, cells), np.log(np.geomspace(*y_ends, cells))
+    hills = _hills(y, np.log(d[shown]), d_sigma[shown] / d[shown]).T
+    density = hills @ _hills(x, mass[shown], sigma[shown])
     shade = LinearSegmentedColormap.from_list("shade", ["#FFFFFF00", BLUE])
-    half = 0.5 / (_CELLS - 1)  # the outermost cells have their middles at the ends of the axes
-    axes.imshow(
-        density, cmap=shade, vmin=0, origin="lower", aspect="auto", interpolation="bilinear",
-        extent=(-half, 1 + half, -half, 1 + half), transform=axes.transAxes,
-    )  # fmt: skip
+    half = 0.5 / (cells - 1)
+    place: Style = {"extent": (-half, 1 + half, -half, 1 + half), "transform": axes.transAxes}
+    how: Style = {"origin": "lower", "aspect": "auto", "interpolation": "bilinear"}
+    axes.imshow(density, cmap=shade, vmin=0, **how, **place)
     for rows, color, mark in ((good, INK, "ok"), (usable & ~good, PURPLE, "flagged")):
-        at = np.flatnonzero(rows)
-        if at.size:
-            if at.size <= MOST_TRACKS:
-                axes.errorbar(
-                    mass[at], d[at], xerr=sigma[at], yerr=_bars(tracks, at), ls="none",
-                    color=color, elinewidth=0.6, alpha=0.6,
-                )  # fmt: skip
-            _points(axes, mass[at], d[at], at, color=color, ms=3, mew=0, label=mark)
+        if 0 < rows.sum() <= MOST_TRACKS:
+            style: Style = {"ls": "none", "elinewidth": 0.6, "alpha": 0.6, "color": color}
+            axes.errorbar(mass[rows], d[rows], _bars(tracks, rows), sigma[rows], **style)
+        if rows.any():
+            points(axes, mass, d, rows, color=color, ms=3, mew=0, label=mark)
     if (usable & ~good).any():
-        figure.legend(loc="outside upper right", ncols=2)
-    axes.set(
-        yscale="log", xlim=x_ends, ylim=y_ends, xlabel=mass_label(analysis), ylabel="D [µm²/s]"
-    )
-    _plain_log(axes)
+        legend(figure)
+    axes.set(xlim=x_ends, ylim=y_ends, xlabel=track_quantity(analysis).axis, ylabel="D [µm²/s]")
+    plain_log(axes, "y")
     return figure
 
 
@@ -199,13 +167,13 @@ def distributions(analysis: Analysis) -> Figure:
     figure = new_figure(7.4, 4.2)
     panels = figure.subplots(2, 2, sharex="col", height_ratios=[2, 3], squeeze=False)
     good = _ok(tracks)
-    mass, sigma = masses(analysis)
     d, d_sigma = (tracks[name].to_numpy(float) for name in ("d_um2_s", "sigma_d_um2_s"))
     columns = [
-        (mass, sigma, np.isfinite(mass), mass_label(analysis), False),
-        (d, d_sigma, np.isfinite(d) & (d > 0), "D [µm²/s]", True),
+        (*masses(analysis), track_quantity(analysis).axis, False),
+        (np.where(d > 0, d, np.nan), d_sigma, "D [µm²/s]", True),
     ]
-    for (above, below), (value, error, usable, label, log) in zip(panels.T, columns, strict=True):
+    for (above, below), (value, error, label, log) in zip(panels.T, columns, strict=True):
+        usable = np.isfinite(value)
         below.set(xlabel=label, yticks=[])
         above.set(yticks=[])
         if not usable.any():
@@ -215,65 +183,55 @@ def distributions(analysis: Analysis) -> Figure:
         grid = np.geomspace(*ends, 400) if log else np.linspace(*ends, 400)
         shown = usable & good if (usable & good).any() else usable
         at, wide = (np.log(value), error / value) if log else (value, error)
-        curve = _density_1d(np.log(grid) if log else grid, at[shown], wide[shown])
+        curve = _hills(np.log(grid) if log else grid, at[shown], wide[shown]).sum(axis=0)
         above.fill_between(grid, curve, color=BLUE, alpha=0.3, lw=0)
         above.plot(grid, curve, color=BLUE, lw=1)
-        order, rank = np.argsort(value[usable]), np.arange(usable.sum(), dtype=float)
-        rows = np.flatnonzero(usable)[order]
-        bars = _bars(tracks, rows) if log else error[rows]
-        for part, color in ((good[rows], BLUE), (~good[rows], PURPLE)):
-            if part.any() and rows.size <= MOST_TRACKS:
-                below.errorbar(
-                    value[rows][part], rank[part],
-                    xerr=bars[..., part], ls="none", color=color, elinewidth=0.7,
-                )  # fmt: skip
-            if part.any():
-                _points(
-                    below, value[rows][part], rank[part], rows[part], color=color, ms=2.5, mew=0
-                )
+        rank = np.argsort(np.argsort(value)).astype(float)
+        for rows, color in ((usable & good, BLUE), (usable & ~good, PURPLE)):
+            if rows.any() and usable.sum() <= MOST_TRACKS:
+                style: Style = {"ls": "none", "elinewidth": 0.7, "color": color}
+                bars = _bars(tracks, rows) if log else error[rows]
+                below.errorbar(value[rows], rank[rows], xerr=bars, **style)
+            if rows.any():
+                points(below, value, rank, rows, color=color, ms=2.5, mew=0)
         above.set(ylim=(0, None))
         above.spines.left.set_visible(False)
         below.spines.left.set_visible(False)
-        if log:
-            below.set_xscale("log")
-            _plain_log(below, "x")
         below.set_xlim(ends)
+        if log:
+            plain_log(below, "x")
     panels[0, 0].set_title("tracks that are ok" if good.any() else "tracks, all flagged")
     panels[1, 0].set_ylabel("tracks, by size")
     return figure
 
 
 def msd(analysis: Analysis, fits: pd.DataFrame) -> Figure | None:
-    """Draw mean-squared displacements beside what each track's D says of them."""
+    """Draw mean-squared displacements of the six longest tracks beside what their D says."""
     tracks, motion = tracks_of(analysis), analysis.summary.get("motion", {})
     rate, exposure = motion.get("frame_rate_hz"), motion.get("exposure_ms")
     usable = tracks[tracks["d_um2_s"].notna() & (tracks["n_d_frames"] >= 2 * MSD_PART)]
     if rate is None or usable.empty:
         return None
     exposure_s = 1 / rate if exposure is None else exposure / 1e3
-    ranked = usable.assign(bad=usable["status"] != str(TrackStatus.OK)).sort_values(
+    ranked = usable.assign(bad=~_ok(usable)).sort_values(
         ["bad", "n_d_frames"], ascending=[True, False]
     )
-    numbers = track_numbers(fits)
-    norm, colors, _ = path_colors(analysis)
-    values, _ = masses(analysis)
+    numbers, shades = track_numbers(fits), _shades(analysis)
     figure = new_figure(6.2, 3.6)
     axes = figure.add_subplot()
-    for row in ranked.head(MSD_TRACKS).index:
+    for row in ranked.head(6).index:
         track = tracks.loc[row]
         path = fits[numbers == track["track"]].drop_duplicates("frame").sort_values("frame")
         lags, measured, error = mean_squared_displacement(path)
-        shade = colors(norm(values[row])) if np.isfinite(values[row]) else _NO_MASS
         seconds = lags / rate
         predicted = 4 * track["d_um2_s"] * (seconds - exposure_s / 3) + error / _UM2
-        axes.plot(1e3 * seconds, measured / _UM2, "o", color=shade, ms=3, mew=0)
-        axes.plot(1e3 * seconds, predicted, color=shade, lw=1.2)
+        axes.plot(1e3 * seconds, measured / _UM2, "o", color=shades[row], ms=3, mew=0)
+        axes.plot(1e3 * seconds, predicted, color=shades[row], lw=1.2)
     axes.plot([], [], "o", color=GREY, ms=3, label="measured")
     axes.plot([], [], color=GREY, lw=1.2, label="from D, errors and blur")
     axes.legend()
-    axes.set(xscale="log", yscale="log", xlabel="lag [ms]", ylabel="MSD in x and y [µm²]")
-    for which in ("x", "y"):
-        _plain_log(axes, which)
+    axes.set(xlabel="lag [ms]", ylabel="MSD in x and y [µm²]")
+    plain_log(axes, "x", "y")
     _scale_beside(figure, axes, analysis)
     return figure
 
@@ -300,7 +258,7 @@ def _ok(tracks: pd.DataFrame) -> BoolArray:
     return np.asarray(tracks["status"] == str(TrackStatus.OK), dtype=bool)
 
 
-def _bars(tracks: pd.DataFrame, rows: NDArray[np.intp]) -> FloatArray:
+def _bars(tracks: pd.DataFrame, rows: BoolArray) -> FloatArray:
     """Lengths of the error bars of D, 68 %: on a logarithmic axis they stay above zero."""
     d, sigma = (tracks[name].to_numpy(float)[rows] for name in ("d_um2_s", "sigma_d_um2_s"))
     factor = np.exp(sigma / d)
@@ -319,30 +277,69 @@ def _log_span(values: FloatArray, errors: FloatArray) -> tuple[float, float]:
     return float((values / wide).min()) / 1.4, float((values * wide).max()) * 1.4
 
 
-def _density_1d(grid: FloatArray, values: FloatArray, errors: FloatArray) -> FloatArray:
-    """Add up a normal curve for each track."""
+def _hills(grid: FloatArray, values: FloatArray, errors: FloatArray) -> FloatArray:
+    """Give each track a normal curve, as wide as its error, shape (tracks, grid)."""
     width = np.maximum(errors, _LEAST_WIDTH * (grid[-1] - grid[0]))[:, None]
-    hills = np.exp(-(((grid - values[:, None]) / width) ** 2) / 2) / width
-    return np.asarray(hills.sum(axis=0))
+    return np.asarray(np.exp(-(((grid - values[:, None]) / width) ** 2) / 2) / width)
 
 
-def _density(
-    x: tuple[FloatArray, FloatArray, FloatArray], y: tuple[FloatArray, FloatArray, FloatArray]
-) -> FloatArray:
-    """Add up a normal hill for each track; each of x and y has values, errors and ends."""
-    parts = []
-    for values, errors, ends in (x, y):
-        grid = np.linspace(ends[0], ends[1], _CELLS)
-        width = np.maximum(errors, _LEAST_WIDTH * (ends[1] - ends[0]))[:, None]
-        parts.append(np.exp(-(((grid - values[:, None]) / width) ** 2) / 2) / width)
-    return np.asarray(parts[1].T @ parts[0])
+# ---- Size and light ------------------------------------------------------------------------------
 
 
-def _plain_log(axes: Axes, which: str = "y") -> None:
-    """Label a logarithmic axis with plain numbers."""
-    axis = axes.xaxis if which == "x" else axes.yaxis
-    low, high = axes.get_xlim() if which == "x" else axes.get_ylim()
-    subs = (1.0,) if high / low > 300 else (1.0, 2.0, 5.0)
-    axis.set_major_locator(LogLocator(subs=subs))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
+def has_plane(analysis: Analysis) -> bool:
+    """Tell whether a track has both diameters."""
+    return "optical_diameter_nm" in tracks_of(analysis) and bool(_usable(analysis).any())
+
+
+def size_plane(analysis: Analysis) -> Figure:
+    """Draw the hydrodynamic diameters, and what their light says, with lines of constant index.
+
+    Spheres of one material lie on a line of constant refractive index, a straight one while they
+    are small beside the wavelength.
+    """
+    config = parse_config(tomllib.loads(analysis.config_toml))
+    matter = material(config.particle, config.optics.wavelength_nm)
+    sphere = sphere_of(config.particle, matter.permittivity, matter.mass_kda)
+    if sphere is None:
+        raise ValueError("only spheres have optical diameters")
+    step = 1e-3  # of a diameter, for the slope along which its error is carried
+    tracks = tracks_of(analysis)[_usable(analysis)]
+    moved, optical = (tracks[f"{kind}diameter_nm"].to_numpy(float) for kind in ("", "optical_"))
+    error, sigma = (tracks[f"sigma_{kind}diameter_nm"].to_numpy(float) for kind in ("", "optical_"))
+
+    def lengths(diameters_nm: FloatArray, one: Sphere) -> FloatArray:
+        """Scattering lengths of spheres of one material."""
+        masses = [sphere_mass_kda(d, one.density_kg_m3) for d in diameters_nm.tolist()]
+        return np.array([scattering_length_nm(one.of_mass(m), config.optics) for m in masses])
+
+    length = lengths(optical, sphere)
+    slope = (lengths(optical * (1 + step), sphere) - length) / (step * optical)
+    figure = new_figure(5.2, 4.2)
+    axes = figure.subplots()
+    ends = 0.7 * min(moved.min(), optical.min()), 1.3 * max(moved.max(), optical.max())
+    diameters = np.linspace(*ends, 200)
+    own = "shell" if sphere.shell_nm else f"{sphere.index.real:.2f}"
+    drawn = [(f"{n:.2f}", replace(sphere, index=complex(n), shell_nm=0.0)) for n in INDICES]
+    absorbs = abs(sphere.index.imag) >= step
+    for label, one in [] if absorbs else [*drawn, (own, sphere)]:
+        line = lengths(diameters, one)
+        color, width = (BLUE, 1.4) if one is sphere else (GREY, 0.7)
+        axes.plot(diameters, line, color=color, lw=width)
+        beside: Style = {"xytext": (3, 0), "textcoords": "offset points", "va": "center"}
+        axes.annotate(label, (diameters[-1], line[-1]), color=color, fontsize="small", **beside)
+    good, up = _ok(tracks), np.abs(slope * sigma)
+    for rows, color, name in ((good, INK, "ok"), (~good, PURPLE, "flagged")):
+        if rows.any():
+            dots: Style = {"fmt": "o", "ms": 3, "elinewidth": 0.7, "color": color, "label": name}
+            axes.errorbar(moved[rows], length[rows], up[rows], error[rows], **dots)
+    if not good.all():
+        axes.legend(loc="upper left")
+    axes.set(xlabel="hydrodynamic diameter [nm]", ylabel="scattering length [nm]")
+    axes.set(xlim=ends, ylim=(0, None))
+    return figure
+
+
+def _usable(analysis: Analysis) -> BoolArray:
+    """Tell which tracks have both diameters; shape (tracks,)."""
+    tracks = tracks_of(analysis)
+    return np.asarray(tracks[["diameter_nm", "optical_diameter_nm"]].notna().all(axis=1))

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from iscat_analysis.bounds import paper
-from iscat_analysis.report.paper import PAPER_FILES
+from iscat_analysis.report.bounds import PAPER_FILES
 from iscat_cli import main
 
 SETUP = {"camera.pixel_size_nm": "84.4", "bounds.pixels": "25"}

@@ -181,7 +181,7 @@ def test_comparison(capsys, tmp_path, monkeypatch) -> None:
     """The table alone: test_bounds makes the figures."""
     found = SimpleNamespace(table=table1(), curves=None, images=None, quantum=None)
     monkeypatch.setattr("iscat_analysis.bounds.paper.reproduce", lambda **_: found)
-    monkeypatch.setattr("iscat_analysis.report.paper.write_paper", lambda *_, **__: None)
+    monkeypatch.setattr("iscat_analysis.report.bounds.write_paper", lambda *_, **__: None)
     printed = _printed(capsys, "bounds", "--preset", "dong2021", "--out", str(tmp_path / "paper"))
     _check(printed, "comparison")
     with pytest.raises(jsonschema.ValidationError):

@@ -16,7 +16,9 @@ from matplotlib.figure import Figure
 
 from iscat_analysis.bounds import paper
 from iscat_analysis.records import EVENT_COLUMNS
-from iscat_analysis.report import render_page, render_report
+from iscat_analysis.report import render_report
+from iscat_analysis.report.numbers import Fact, numeric, tabulate, worded
+from iscat_analysis.report.page import Chart, Section, render_document
 from iscat_analysis.report.style import BLUE, VERMILLION, new_figure, publish
 from iscat_cli import main
 
@@ -153,7 +155,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory, written: dict[str, Path]) ->
     }
     texts = {name: render_report(analysis) for name, analysis in analyses.items()}
     texts |= {f"batch_{n}": make_batch_page(n) for n in (1, 3, 60)}
-    texts["document"] = render_page("document.html", DOCUMENT)
+    texts["document"] = render_document("Bounds along z", "", [SCAN])
     found = dict(written)
     for name, text in texts.items():
         found[name] = folder / f"{name}.html"
@@ -171,20 +173,20 @@ def lines() -> Iterator[tuple[str, Figure]]:
     yield "lines", figure
 
 
-DOCUMENT = {
-    "title": "Bounds along z",
-    "sections": [
-        {
-            "id": "scan",
-            "title": "Scan",
-            "lead": "A figure and a table.",
-            "facts": [{"label": "trials", "value": "1000", "note": "per mode"}],
-            "charts": [{"id": "lines", "title": "Lines", "svg": publish(lines())["lines"]}],
-            "tables": [{"caption": "Numbers", "columns": ["of", {"label": "σ", "numeric": True}],
-                        "rows": [["x", 3.0], ["y", 10.0], ["z", float("nan")], ["mass", 2.0]]}],
-        }
+SCAN = Section(
+    "scan",
+    "Scan",
+    "A figure and a table.",
+    [Fact("trials", "1000", note="per mode")],
+    [Chart("lines", "Lines", publish(lines())["lines"])],
+    [
+        tabulate(
+            [("x", 3.0), ("y", 10.0), ("z", float("nan")), ("mass", 2.0)],
+            (worded("of", 0), numeric("σ", 1)),
+            "Numbers",
+        )
     ],
-}  # fmt: skip
+)
 
 
 READY = """

@@ -29,11 +29,11 @@ import pytest
 from sketches import sketch_figures
 
 from iscat_analysis import pipeline  # what a run imports, before the clock runs
-from iscat_analysis.report import page
+from iscat_analysis.report import movie_page
 from iscat_analysis.search import chunks
 from iscat_cli import main
 
-LOADED = (pipeline, page)
+LOADED = (pipeline, movie_page)
 
 
 def _run(order: dict[str, Any]) -> int:

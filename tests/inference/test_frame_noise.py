@@ -16,7 +16,7 @@ from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.report import render_report
-from iscat_analysis.report.headline import headline
+from iscat_analysis.report.answer import headline
 from iscat_analysis.search.empty import EmptyField
 from iscat_analysis.trust.empirical_spread import likely_noise
 

@@ -24,7 +24,7 @@ from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.optics.materials import material
 from iscat_analysis.optics.spheres import Sphere, amplitudes, coefficients, scattering_length_nm
 from iscat_analysis.records import PARAMETERS, with_diameters
-from iscat_analysis.report.headline import as_diameters
+from iscat_analysis.report.answer import as_diameters
 from iscat_analysis.trust.assumed import assumed_error
 from iscat_analysis.trust.response import response_of
 from iscat_analysis.units import sphere_mass_kda

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 import iscat_analysis as ia
 from iscat_analysis import result as shown
 from iscat_analysis.records import REPEAT_COLUMNS
-from iscat_analysis.report.pictures import draw
+from iscat_analysis.report.figures import draw
 
 SMALL = {
     "simulation.frames": 120,

@@ -19,15 +19,16 @@ from matplotlib.figure import Figure
 
 from iscat_analysis.config import load_config, parse_config
 from iscat_analysis.errors import DataError
+from iscat_analysis.findings.results import NOT_A_MASS
 from iscat_analysis.pipeline.stored import open_result
 from iscat_analysis.records import EVENT_COLUMNS, Analysis, Status, tally
 from iscat_analysis.report import check_output, figures, render_page, render_report, write_report
-from iscat_analysis.report.answer import answer_in, answers
-from iscat_analysis.report.context import measured_lines
+from iscat_analysis.report.answer import answer_in, answers, headline, precision_of
 from iscat_analysis.report.event_figures import CREDIBLE_LEVELS, credible_shades
-from iscat_analysis.report.headline import NOT_A_MASS, headline, precision_of
-from iscat_analysis.report.numbers import number
+from iscat_analysis.report.movie_page import measured_lines
+from iscat_analysis.report.numbers import number, numeric, tabulate, worded
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder
+from iscat_analysis.report.page import Chart, Section, render_document
 from iscat_analysis.report.style import new_figure, publish
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.result import Result
@@ -407,7 +408,7 @@ def test_without_calibration_the_headline_is_a_contrast() -> None:
     bare = replace(analysis, summary={**analysis.summary, "mass_scale": "absolute model"})
     assert not any("Not calibrated" in line for line in headline(analysis, event_table(analysis)))
     said = headline(bare, event_table(bare))
-    assert NOT_A_MASS in said
+    assert f"{NOT_A_MASS().text}." in said
     assert "Median contrast" in said[0]
     assert "kDa" not in said[0]
     page = render_report(bare)
@@ -482,22 +483,15 @@ def test_numbers_are_written_for_people(value: float | None, text: str) -> None:
 
 
 def test_documents_escape_what_they_are_given() -> None:
-    page = render_page(
-        "document.html",
-        {
-            "title": "Bounds & <friends>",
-            "sections": [
-                {
-                    "id": "one",
-                    "title": "One",
-                    "notes": ["a < b"],
-                    "charts": [{"id": "c", "title": "</script><b>", "svg": Markup("<svg></svg>")}],
-                    "tables": [{"caption": "t", "columns": ["a", {"label": "b", "numeric": True}],
-                                "rows": [["<i>", np.nan], ["x", -1.25]]}],
-                }
-            ],
-        },
-    )  # fmt: skip
+    columns = worded("a", 0), numeric("b", 1)
+    section = Section(
+        "one",
+        "One",
+        notes=["a < b"],
+        charts=[Chart("c", "</script><b>", Markup("<svg></svg>"))],
+        tables=[tabulate([["<i>", np.nan], ["x", -1.25]], columns, "t")],
+    )
+    page = render_document("Bounds & <friends>", "", [section])
     assert "Bounds &amp; &lt;friends&gt;" in page
     assert "<i>" not in page
     assert "−1.25" in page

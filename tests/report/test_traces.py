@@ -14,10 +14,14 @@ from report_factory import make_analysis, with_traces
 
 from iscat_analysis.fitting.run import packed_views, unpacked_views
 from iscat_analysis.records import Clip, EventView, Trace
-from iscat_analysis.report.event_figures import event_details
-from iscat_analysis.report.films import CLIP_MS, clip_shown
+from iscat_analysis.report.event_figures import (
+    CLIP_MS,
+    clip_shown,
+    event_details,
+    trace_svg,
+    trace_words,
+)
 from iscat_analysis.report.tables import event_table
-from iscat_analysis.report.traces import trace_svg, trace_words
 from iscat_analysis.result import Result
 
 

@@ -13,10 +13,10 @@ from PIL import Image
 from report_factory import make_analysis
 from walkers import EXPOSURE_MS, RATE_HZ, fits_of, walk
 
+from iscat_analysis.findings.results import NOT_A_MASS
 from iscat_analysis.records import FREE_PARAMETERS, TRACK_COLUMNS, free_parameters
-from iscat_analysis.report import films, render_report, size_plane, track_figures, write_report
-from iscat_analysis.report.headline import NOT_A_MASS
-from iscat_analysis.report.tracks import tracks_headline
+from iscat_analysis.report import event_figures, render_report, track_figures, write_report
+from iscat_analysis.report.answer import headline
 from iscat_analysis.result import Result
 
 
@@ -44,7 +44,7 @@ def test_a_page_of_tracks_shows_paths_masses_speeds_and_films(tmp_path: Path) ->
 def test_spheres_lie_on_lines_of_constant_index() -> None:
     """The configured one runs through spheres whose two diameters are equal."""
     analysis = make_analysis(40, "track")
-    assert not size_plane.has_plane(analysis)
+    assert not track_figures.has_plane(analysis)
     assert analysis.tracks is not None
     sizes = np.linspace(60.0, 180.0, len(analysis.tracks))
     tracks = analysis.tracks.assign(
@@ -61,8 +61,8 @@ frames = [0, 9]
 mode = "track"
 """
     spheres = replace(analysis, tracks=tracks, config_toml=toml)
-    assert size_plane.has_plane(spheres)
-    (axes,) = size_plane.size_plane(spheres).axes
+    assert track_figures.has_plane(spheres)
+    (axes,) = track_figures.size_plane(spheres).axes
     lines = [line for line in axes.lines if len(line.get_xdata()) == 200]
     own = np.asarray(lines[-1].get_xydata(), dtype=float)
     dots = [np.asarray(line.get_xydata()) for line in axes.lines if line.get_marker() == "o"]
@@ -73,9 +73,9 @@ mode = "track"
 
 def test_films_that_would_fill_the_page_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     analysis = make_analysis(40, "track")
-    assert len(list(films.films_shown(analysis))) == 2
-    monkeypatch.setattr(films, "FILM_BYTES", 9000)
-    assert len(list(films.films_shown(analysis))) == 1
+    assert len(list(event_figures.films_shown(analysis))) == 2
+    monkeypatch.setattr(event_figures, "FILM_BYTES", 9000)
+    assert len(list(event_figures.films_shown(analysis))) == 1
 
 
 def test_the_line_through_a_mean_squared_displacement_is_the_one_expected() -> None:
@@ -95,17 +95,17 @@ def test_a_headline_of_tracks_that_are_flagged_has_no_median() -> None:
     analysis = make_analysis(200, "track")
     assert analysis.tracks is not None
     tracks = analysis.tracks.assign(status="ok", flags="")
-    said = tracks_headline(replace(analysis, tracks=tracks), analysis.table)
+    said = headline(replace(analysis, tracks=tracks), analysis.table)
     assert "Over tracks: median mass" in said[0]
     tracks.loc[:4, ["status", "flags"]] = "not_free"
-    said = tracks_headline(replace(analysis, tracks=tracks), analysis.table)
+    said = headline(replace(analysis, tracks=tracks), analysis.table)
     assert "5 of 20 that are long enough are flagged" in said[0]
     assert "median mass" not in said[0]
     tracks.loc[:4, ["status", "flags"]] = "few_frames"
-    assert "median mass" in tracks_headline(replace(analysis, tracks=tracks), analysis.table)[0]
+    assert "median mass" in headline(replace(analysis, tracks=tracks), analysis.table)[0]
     bare = replace(analysis, tracks=tracks, summary={**analysis.summary, "mass_scale": "absolute"})
-    said = tracks_headline(bare, analysis.table)
-    assert NOT_A_MASS in said
+    said = headline(bare, analysis.table)
+    assert f"{NOT_A_MASS().text}." in said
     assert "contrast" in said[0]
     assert "kDa" not in said[0]
 

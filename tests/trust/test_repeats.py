@@ -31,8 +31,7 @@ from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline.summary import species_of
 from iscat_analysis.records import FREE_PARAMETERS, Candidate
 from iscat_analysis.report import render_report
-from iscat_analysis.report.headline import headline
-from iscat_analysis.report.spread import rejection, species_widths
+from iscat_analysis.report.answer import headline, rejection, species_widths
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.search.empty import CONTRASTS, EmptyField
 from iscat_analysis.species.tables import event_table as events_of
@@ -370,9 +369,12 @@ def test_a_rejected_model_is_named_where_the_spread_is() -> None:
     rng = np.random.default_rng(9)
     table = make_analysis(300).table
     fair = table.assign(p_value=rng.uniform(size=300))
-    assert rejection(fair) == ""
+    assert rejection(fair) is None
     poor = fair.assign(p_value=np.where(np.arange(300) < 30, 1e-6, fair["p_value"]))
-    assert "The model is rejected: 3" in rejection(poor)
+    found = rejection(poor)
+    assert found is not None
+    assert found.code == "model-rejected"
+    assert 30 <= found.values["poor"] < 40
     analysis = _measured(1.0)
     table = analysis.table.assign(p_value=1e-9)
     said = headline(replace(analysis, table=table), table)
@@ -384,14 +386,14 @@ def test_the_model_of_moving_particles_is_rejected_by_most_tracks_and_not_by_two
     rng = np.random.default_rng(2)
     p, track = rng.uniform(size=3000), np.repeat(np.arange(15), 200)
     table = pd.DataFrame({"p_value": p, "track": track, "status": "ok"})
-    assert rejection(table) == ""
+    assert rejection(table) is None
     disturbed = table.assign(p_value=np.where(track < 2, p**4, p))  # as by one out of the field
-    assert rejection(disturbed) == ""
-    assert "rejected" in rejection(disturbed.drop(columns="track"))
+    assert rejection(disturbed) is None
+    assert rejection(disturbed.drop(columns="track")) is not None
     everywhere = table.assign(p_value=p**1.5)
-    assert "rejected" in rejection(everywhere)
+    assert rejection(everywhere) is not None
     alone = disturbed[track == 0]
-    assert "rejected" in rejection(alone)
+    assert rejection(alone) is not None
 
 
 def test_the_width_of_a_species_is_told_with_its_interval() -> None:

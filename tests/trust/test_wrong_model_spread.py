@@ -8,7 +8,7 @@ import pytest
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline import analyse
-from iscat_analysis.report.headline import spread_lines
+from iscat_analysis.report.answer import spread_lines
 from iscat_analysis.study import Movie
 
 FRAMES, SIDE, COUNT, WINDOW = 400, 160, 24, 50

@@ -1,0 +1,395 @@
+"""Species, sizes, samples beside each other and equilibria: their sections and figures.
+
+Everything arrives as what ``summary.json`` and the documents of the commands hold; nothing is
+computed here.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import PurePath
+from typing import Any, Literal
+
+import matplotlib as mpl
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from iscat_analysis.report.numbers import (
+    fixed,
+    intervals,
+    number,
+    numeric,
+    percent,
+    sentence,
+    tabulate,
+)
+from iscat_analysis.report.page import Chart, Section
+from iscat_analysis.report.style import (
+    BLUE,
+    GREY,
+    INK,
+    PURPLE,
+    STYLE,
+    VERMILLION,
+    Style,
+    floats,
+    new_figure,
+    whiskers,
+)
+from iscat_analysis.text import in_figure
+
+PALETTES: Mapping[str, tuple[str, ...]] = {
+    "colour-blind safe": (BLUE, VERMILLION, PURPLE, "#009E73", "#E69F00", "#56B4E9"),
+    "greys": ("#000000", "#555555", "#888888", "#AAAAAA", "#333333", "#777777"),
+}
+"""Colours of samples, by name."""
+
+FONTS = ("sans-serif", "serif", "monospace")
+"""Families of letters."""
+
+Format = Literal["svg", "pdf", "png"]
+
+_NAMED = 12  # samples whose names fit beside an axis
+
+
+# ---- Species of a movie --------------------------------------------------------------------------
+
+
+def distribution_section(found: Mapping[str, Any], figures: Mapping[str, Markup]) -> Section | None:
+    """Lay out a distribution as one section of a page."""
+    if not found["species"]:
+        return None
+    width = found["histogram"]["high_kda"][0] - found["histogram"]["low_kda"][0]
+    caption = (
+        f"Landing and leaving by |mass|, in bins of {width:g} kDa; the species are fitted to the "
+        "events, not to the bins."
+    )
+    columns = (
+        *intervals("mass [kDa]", ("mass_kda", "mass_low", "mass_high")),
+        *intervals(
+            "width [kDa]",
+            ("width_kda", "width_low", "width_high"),
+            titles=("beyond the events' measurement errors", ""),
+        ),
+        numeric("events", lambda s: fixed(s["count"], 0), "that were seen"),
+        numeric("landing", lambda s: fixed(s["landing"], 0)),
+        numeric("leaving", lambda s: fixed(s["leaving"], 0)),
+        numeric(
+            "detected",
+            lambda s: percent(s["efficiency"], 1),
+            "chance that such a particle is detected",
+        ),
+        *intervals(
+            "came",
+            ("count_corrected", "corrected_low", "corrected_high"),
+            titles=("events corrected for those that were missed", ""),
+        ),
+        *intervals(
+            "fraction",
+            ("fraction", "fraction_low", "fraction_high"),
+            scale=100,
+            unit=" %",
+            titles=("of the particles that came", ""),
+        ),
+    )
+    title = f"Species by mass; intervals from {found['draws']} simulated repetitions"
+    return Section(
+        "species",
+        "Species",
+        _lead(found),
+        charts=[Chart("species-figure", "Masses and species", figures["species"], caption, True)],
+        tables=[tabulate(found["species"], columns, title)],
+        notes=[sentence(note) for note in found["notes"]],
+    )
+
+
+def _lead(found: Mapping[str, Any]) -> str:
+    described = [item for item in found["species"] if not item.get("background")]
+    fitted = len(described)
+    count = sum(not item["outlier"] for item in described)
+    rivals = [row["delta_bic"] for row in found["selection"] if row["species"] != fitted]
+    text = (
+        f"{count} species explain {found['events']} events best (BIC), fitted to the events "
+        "themselves, each with its own error."
+        if count > 1
+        else f"One species explains {found['events']} events best (BIC)."
+    )
+    if count < fitted:
+        text += " What lies apart from them in one or two events is listed, and is no species."
+    for item in found["species"]:
+        if item.get("background"):
+            share = 100 * item["count"] / found["events"]
+            text += f" {share:.2g} % of the events are background, which is no species."
+    support = found["support"]
+    wins = ""
+    if support is not None and support == support:
+        wins = f" in {100 * support:.0f} % of simulated repetitions the same number wins."
+    if rivals:
+        text += f" The next best number is worse by {number(min(rivals), 2)}" + (
+            ";" if wins else "."
+        )
+    return text + wins
+
+
+def species_figure(found: Mapping[str, Any]) -> Figure | None:
+    """Draw masses, species and the efficiency of their detection."""
+    if not found["species"]:
+        return None
+    curves = {name: floats(values) for name, values in found["curves"].items()}
+    mass, efficiency = curves["mass_kda"], curves["efficiency"]
+    missed = efficiency.min() < 1
+    figure = new_figure(9.6, 3.4)
+    panels = figure.subplots(1, 2, width_ratios=(2.2, 1)) if missed else [figure.add_subplot()]
+    width = _bars(panels[0], found["histogram"], "kda", "events")
+    density, error = width * curves["density"], width * curves["density_se"]
+    low, high = np.maximum(density - 1.96 * error, 0), density + 1.96 * error
+    panels[0].fill_between(mass, low, high, color=BLUE, alpha=0.2, lw=0)
+    panels[0].plot(mass, density, color=BLUE, lw=1, label="kernel density, 95 %")
+    panels[0].plot(mass, width * curves["model"], color=VERMILLION, lw=1.6, label="species")
+    panels[0].set(xlabel="|mass| [kDa]", ylabel=f"events per {width:g} kDa")
+    if missed:
+        corrected = width * curves["model_corrected"]
+        panels[0].plot(mass, corrected, "--", color=PURPLE, label="corrected for what was missed")
+        panels[1].plot(mass, efficiency, color=INK)
+        known = [s for s in found["species"] if not s.get("background")]
+        at = [s["mass_kda"] for s in known]
+        panels[1].plot(at, [s["efficiency"] for s in known], "o", color=VERMILLION)
+        panels[1].set(xlabel="|mass| [kDa]", title="Chance of detection", ylim=(0, 1.05))
+    for rung in found["species"]:
+        if rung.get("n"):
+            panels[0].axvline(rung["mass_kda"], color=GREY, lw=0.8, ls=":", zorder=0)
+            place: Style = {"xycoords": ("data", "axes fraction"), "ha": "center"}
+            panels[0].annotate(str(rung["n"]), (rung["mass_kda"], 1), va="bottom", **place)
+    panels[0].legend(loc="best")  # said, because without it Matplotlib warns where that is slow
+    return figure
+
+
+def _bars(axes: Axes, bars: Mapping[str, Any], unit: str, label: str) -> float:
+    """Draw a histogram of a document; give the width of its bins."""
+    low, high = bars[f"low_{unit}"], bars[f"high_{unit}"]
+    edges = [*low, high[-1]]
+    axes.stairs(bars["count"], edges, fill=True, color=GREY, alpha=0.5, label=label)
+    return float(high[0] - low[0])
+
+
+def sizes_section(found: Mapping[str, Any], figures: Mapping[str, Markup]) -> Section:
+    """Lay out populations of diameters as one section of a page."""
+    many = len(found["populations"])
+    some = f"{many} log-normal populations of diameters explain"
+    which = some if many > 1 else "One log-normal population of diameters explains"
+    caption = (
+        "Diameters of spheres that were seen. The curve has the errors of the diameters; each bar "
+        "reaches from the median of a population over one geometric standard deviation without "
+        "them."
+    )
+    columns = (
+        *intervals("median diameter [nm]", ("diameter_nm", "diameter_low", "diameter_high")),
+        *intervals(
+            "geometric standard deviation",
+            ("geometric_sd", "geometric_sd_low", "geometric_sd_high"),
+            titles=("of the diameters, beyond their errors", ""),
+        ),
+        *intervals(
+            "fraction",
+            ("fraction", "fraction_low", "fraction_high"),
+            scale=100,
+            unit=" %",
+            titles=("of the spheres that were seen", ""),
+        ),
+        numeric("spheres", lambda p: fixed(p["count"], 0) + (", outlier" if p["outlier"] else "")),
+    )
+    title = f"Populations by diameter; intervals from {found['draws']} simulated repetitions"
+    return Section(
+        "species",
+        "Sizes",
+        f"{which} {found['spheres']} spheres best (BIC), each with its own error.",
+        charts=[
+            Chart("species-figure", "Diameters and populations", figures["sizes"], caption, True)
+        ],
+        tables=[tabulate(found["populations"], columns, title)],
+        notes=[sentence(note) for note in found["notes"]],
+    )
+
+
+def sizes_figure(found: Mapping[str, Any]) -> Figure:
+    """Draw the histogram of diameters and the populations."""
+    figure = new_figure(9.6, 3.4)
+    axes = figure.add_subplot()
+    width = _bars(axes, found["histogram"], "nm", "spheres")
+    diameter, model = floats(found["curve"]["diameter_nm"]), width * floats(found["curve"]["model"])
+    axes.plot(diameter, model, color=VERMILLION, lw=1.6, label="populations, with errors")
+    for each in found["populations"]:
+        middle, spread = each["diameter_nm"], each["geometric_sd"]
+        height, ends = (
+            np.interp(middle, diameter, model) / 2,
+            [[middle / spread], [middle * spread]],
+        )
+        whiskers(axes, [height], [middle], ends, along="x", color=INK, capsize=3)
+    axes.set(xlabel="diameter [nm]", ylabel=f"spheres per {width:g} nm", ylim=(0, None))
+    axes.legend(loc="best")
+    return figure
+
+
+# ---- Samples and equilibria ----------------------------------------------------------------------
+
+
+def comparison_figure(
+    found: Mapping[str, Any], histograms: Sequence[Mapping[str, Any]]
+) -> Iterator[tuple[str, Figure]]:
+    """Draw mass distributions over each other, shifts and differences of fractions."""
+    pairs = found["comparisons"]
+    figure = new_figure(11.5, max(3.4, 1.6 + 0.3 * min(len(pairs), _NAMED)))
+    left, middle, right = figure.subplots(1, 3, width_ratios=(1.8, 1, 1))
+    colours = (GREY, VERMILLION, BLUE, PURPLE)
+    for place, drawn in enumerate(histograms):
+        style: Style = {
+            "color": colours[place % 4],
+            "fill": not place,
+            "alpha": 0.9 if place else 0.5,
+        }
+        name = _short(drawn["source"])
+        left.stairs(drawn["share"], drawn["edges"], lw=1.2, label=name, **style)
+    width = histograms[0]["edges"][1] - histograms[0]["edges"][0]
+    left.set(xlabel="|mass| [kDa]", ylabel=f"share of events per {number(width, 2)} kDa")
+    left.legend()
+    _intervals(middle, pairs, ("shift_kda", "shift_low", "shift_high"), "shift [kDa]")
+    differences = ("difference", "difference_low", "difference_high")
+    _intervals(right, pairs, differences, "difference of fractions")
+    right.set_yticklabels([])
+    handles, labels = middle.get_legend_handles_labels()
+    right.legend(handles, labels, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    right.locator_params(axis="x", nbins=5)
+    yield "comparison", figure
+
+
+def _intervals(
+    axes: Axes, pairs: Sequence[Mapping[str, Any]], names: tuple[str, str, str], label: str
+) -> None:
+    """Draw one point with its 95 % interval for each sample and species."""
+    kinds = len(pairs[0]["species"])
+    for i in range(kinds):
+        colour = (VERMILLION, BLUE, PURPLE, INK)[i % 4]
+        rows = [pair["species"][i] for pair in pairs]
+        at, low, high = (floats(row[name] for row in rows) for name in names)
+        places = np.arange(len(rows)) + 0.6 * ((i + 0.5) / kinds - 0.5)
+        name = f"{number(rows[0]['mass_kda'])} kDa"
+        whiskers(axes, places, at, (low, high), along="x", ms=3.5, color=colour, label=name)
+    axes.axvline(0, color=GREY, lw=0.8)
+    axes.set(xlabel=f"{label}, 95 %", ylim=(len(pairs) - 0.5, -0.5))
+    if len(pairs) <= _NAMED:
+        axes.set_yticks(range(len(pairs)), [_short(pair["source"]) for pair in pairs])
+    else:
+        axes.set_ylabel("sample")
+
+
+def _short(source: str) -> str:
+    """Name a table by its folder where the file is named as all are."""
+    path = PurePath(source)
+    name = path.parent.name if path.stem == "fits" and path.parent.name else path.name
+    return in_figure(name if len(name) <= 24 else f"{name[:23]}…")
+
+
+def binding_figure(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
+    """Draw fractions of complexes with their intervals, the equilibrium and the profile."""
+    figure = new_figure(9.6, 3.6)
+    left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
+    dimer = found["model"] == "dimer"
+    rows, names = found["samples"], ("complexes", "complexes_low", "complexes_high", "predicted")
+    at = floats(row["concentration_nm"] if dimer else row["a_nm"] + row["b_nm"] for row in rows)
+    share, low, high, predicted = (floats(row.get(name) for row in rows) for name in names)
+    side = np.ones(at.size)
+    for value in np.unique(at):  # replicates beside each other
+        same = np.flatnonzero(at == value)
+        side[same] = 1 + 0.06 * (np.arange(same.size) - (same.size - 1) / 2)
+    whiskers(left, at * side, share, (low, high), color=BLUE, label="tables, 95 %")
+    line: Style = {"color": VERMILLION, "label": "equilibrium"}
+    if dimer:
+        left.plot(found["curve"]["concentration_nm"], found["curve"]["complexes"], **line)
+    else:
+        left.plot(at * side, predicted, "_", ms=12, mew=1.6, **line)
+    both, complexes = ("monomers", "dimers") if dimer else ("A and B", "AB")
+    left.set(xscale="log", ylim=(0, 1))
+    left.set(xlabel=f"{both} in all [nM]", ylabel=f"{complexes} among the particles")
+    left.legend(loc="upper left")
+    _draw_profile(right, found)
+    yield "kd", figure
+
+
+def _draw_profile(axes: Axes, found: Mapping[str, Any]) -> None:
+    """Draw twice the log-likelihood lost against K_D, and the limit of a 95 % interval."""
+    limit, best = 3.84, found["kd_nm"]
+    at, deviance = floats(found["profile"]["ln_kd_nm"]), floats(found["profile"]["deviance"])
+    if at.size > 1:
+        root = np.sign(at - np.log(best)) * np.sqrt(deviance)
+        fine = np.linspace(at[0], at[-1], 100)
+        axes.plot(np.exp(fine), np.interp(fine, at, root) ** 2, color=INK)
+    axes.plot(np.exp(at), deviance, "o", ms=3.5, color=INK)
+    axes.axhline(limit, color=GREY, lw=0.8, ls="--")
+    axes.axvline(best, color=VERMILLION, lw=1)
+    axes.set(xlabel="$K_D$ [nM]", ylabel="2 (largest log-likelihood − profile)")
+    axes.set(ylim=(0, 2.2 * limit), title=f"$K_D$ = {number(best)} nM")
+    low, high = found["kd_low"], found["kd_high"]
+    if low and high:
+        beyond = (high / low) ** 0.5
+        axes.set_xlim(low / beyond, high * beyond)
+
+
+# ---- A histogram with its gates, for the app -----------------------------------------------------
+
+
+def histogram_figure(
+    samples: Sequence[tuple[str, Any]],
+    *,
+    size_cm: tuple[float, float] = (12.0, 8.0),
+    font: tuple[str, float] = ("sans-serif", 9.0),
+    palette: str = "colour-blind safe",
+    gates: Sequence[Any] = (),
+    curve: tuple[Any, Any] | None = None,
+    density: bool = True,
+) -> Figure:
+    """Draw histograms over each other, shaded gates, and the curve of the species.
+
+    A sample is its name and a `MassHistogram`; several are drawn as shares.  The font has a family
+    and a size [pt].
+    """
+    colours = PALETTES[palette]
+    shares = len(samples) > 1
+    with mpl.rc_context({**STYLE, "font.family": font[0], "font.size": font[1]}):
+        figure = new_figure(*(side / 2.54 for side in size_cm))
+        axes = figure.add_subplot()
+        for place, (name, mass) in enumerate(samples):
+            scale = 1.0 / max(mass.counts.sum(), 1.0) if shares else 1.0
+            colour = colours[place % len(colours)]
+            style: Style = {"fill": True, "alpha": 0.45, "color": GREY}
+            if shares:
+                style = {"fill": False, "alpha": 0.9, "color": colour}
+            axes.stairs(mass.counts * scale, mass.edges, label=name, **style)
+            if density:
+                axes.plot(mass.mass_kda, mass.density * scale, color=colour, lw=1.2)
+        if curve is not None:
+            axes.plot(*map(np.asarray, curve), color=VERMILLION, lw=1.6, label="species")
+        for each in gates:
+            axes.axvspan(each.low_kda, each.high_kda, color=BLUE, alpha=0.12, lw=0)
+            text = f"{each.mean_kda:.0f} kDa\n{each.count}"
+            middle = ((each.low_kda + each.high_kda) / 2, 0.98)
+            place_of: Style = {"xycoords": ("data", "axes fraction"), "ha": "center"}
+            axes.annotate(text, middle, color=INK, va="top", **place_of)
+        bar = samples[0][1].bin_kda if samples else 1.0
+        label = "share of events" if shares else "events"
+        axes.set(xlabel="|mass| [kDa]", ylabel=f"{label} per {bar:g} kDa")
+        axes.set_xlim(left=0)
+        axes.set_ylim(bottom=0)
+        if shares or curve is not None:
+            axes.legend(loc="best")
+    return figure
+
+
+def figure_bytes(figure: Figure, kind: Format, *, dpi: int = 300) -> bytes:
+    """Write a figure as a file's contents."""
+    buffer = io.BytesIO()
+    with mpl.rc_context(STYLE):
+        figure.savefig(buffer, format=kind, dpi=dpi)
+    return buffer.getvalue()
