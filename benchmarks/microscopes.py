@@ -43,6 +43,7 @@ from instruments import Instrument, InstrumentMovie, Landings, draw_landings
 from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.fitting.results import DetectionResult
+from iscat_analysis.fitting.run import Run
 from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.landing.find import analyse_landings
 
@@ -145,8 +146,7 @@ def analyse(movie: InstrumentMovie, config: Config, said: list[str]) -> Detectio
         movie,
         config,
         camera_from_config(config.camera, movie.shape[1:], movie.dtype),
-        warn=said.append,
-        progress=lambda *_: None,
+        Run(notify=said.append),
     )
 
 

@@ -28,6 +28,7 @@ from scipy.stats import poisson
 from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.fitting.results import DetectionResult
+from iscat_analysis.fitting.run import Run
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.records import FRAME_COLUMN
 from iscat_analysis.study import Movie
@@ -67,7 +68,7 @@ def analyse(config: Config, seed: int) -> tuple[pd.DataFrame, DetectionResult]:
         counts[frame] = image
     found = analyse_landings(
         Memory(counts), config, camera_from_config(config.camera, simulation.shape, np.uint16),
-        warn=lambda text: print(f"   {text}", flush=True), progress=lambda *_: None,
+        Run(notify=lambda text: print(f"   {text}", flush=True)),
     )  # fmt: skip
     truth = movie.truth
     landing = truth.assign(sign=1)

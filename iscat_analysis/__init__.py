@@ -101,7 +101,7 @@ if TYPE_CHECKING:
     from iscat_analysis.pieces import psf as psf
     from iscat_analysis.pieces import qcrb as qcrb
     from iscat_analysis.pipeline import fit_stack as fit_stack
-    from iscat_analysis.pipeline.preview import Look as Look
+    from iscat_analysis.pipeline.kinds import Look as Look
     from iscat_analysis.pipeline.preview import Preview as Preview
     from iscat_analysis.pipeline.stored import StoredResult as StoredResult
     from iscat_analysis.pipeline.stored import open_result as open_result
@@ -159,7 +159,7 @@ _HOME = {
     "open_result": "pipeline.stored",
     "StoredResult": "pipeline.stored",
     "Preview": "pipeline.preview",
-    "Look": "pipeline.preview",
+    "Look": "pipeline.kinds",
     "to_photomol": "report.exchange",
     "to_picasso": "report.exchange",
     "configure": "config",

@@ -136,11 +136,16 @@ def first_line(error: BaseException) -> str:
 
 def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFrame:
     """Read a table from a Parquet file."""
+    with open_regular(path) as file:
+        return parquet_of(file, columns)
+
+
+def parquet_of(file: BinaryIO, columns: Sequence[str] | None = None) -> pd.DataFrame:
+    """Read a table from the content of a Parquet file."""
     import pandas as pd
     import pyarrow as pa
 
-    with open_regular(path) as file:
-        try:
-            return pd.read_parquet(file, columns=None if columns is None else list(columns))
-        except (pa.ArrowException, *_OF_DAMAGE) as error:
-            raise ValueError(first_line(error)) from None
+    try:
+        return pd.read_parquet(file, columns=None if columns is None else list(columns))
+    except (pa.ArrowException, *_OF_DAMAGE) as error:
+        raise ValueError(first_line(error)) from None

@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from iscat_analysis.diagnosis.calibrated import LIGHT_STEPS, SCAN_STEPS, Prepared, Step, calibrated
+from iscat_analysis.diagnosis.calibrated import (
+    LIGHT_STEPS,
+    SCAN_STEPS,
+    Prepared,
+    Step,
+    calibrated,
+    within,
+)
 from iscat_analysis.diagnosis.causes import (
     axes_warning,
     fixed_height_warning,

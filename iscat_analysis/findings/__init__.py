@@ -8,7 +8,7 @@ that stand in the sentence.  One place prints them, the page sorts them by sever
 
 from __future__ import annotations
 
-from iscat_analysis.findings import camera, files
+from iscat_analysis.findings import camera, files, particles
 from iscat_analysis.findings.registry import (
     KINDS,
     Finding,
@@ -26,5 +26,5 @@ from iscat_analysis.findings.registry import (
 
 __all__ = [
     "KINDS", "Finding", "FindingKind", "Findings", "Severity", "aside", "camera", "define",
-    "existing", "files", "printing", "remark", "unreported", "warnings_in",
+    "existing", "files", "particles", "printing", "remark", "unreported", "warnings_in",
 ]  # fmt: skip

@@ -17,6 +17,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from iscat_analysis.camera import smooth_background
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.particles import INDEX_UNKNOWN
 from iscat_analysis.fitting.context import AnalysisContext, is_counted
 from iscat_analysis.inference.counts import MEAN, choose_noise, counts_likelihood
 from iscat_analysis.inference.free_index import fit_index
@@ -289,19 +291,20 @@ def with_index(context: AnalysisContext, event: Event) -> tuple[Event, Told | No
     return replace(event, likelihood=own.likelihood, fit=own.fit, flags=flags), told
 
 
-def untold_message(untold: Sequence[Told], missing: int, total: int, n_sample: float) -> str:
-    """Say what pictures tell that do not tell diameter and index apart; empty if all do."""
+def index_finding(
+    context: AnalysisContext, untold: Sequence[Told], missing: int, total: int, *, where: str = ""
+) -> Finding | None:
+    """Tell what images show that do not tell diameter and index apart."""
     if not missing:
-        return ""
+        return None
     known = [told for told in untold if math.isfinite(told[1])]
-    said = ""
+    best = ""
     if known:
         power, sigma = np.median(known, axis=0).tolist()
-        said = f": they tell d^{power:.2g} (n − {n_sample:g}) to {100 * sigma:.2g} %"
-    return (
-        f"the pictures of {missing} of {count(total, 'sphere')} do not tell diameter and index "
-        f"apart{said}; refractive_index is empty, and diameter_nm that of the configured index"
-    )
+        n_sample = context.model.optics.n_sample
+        best = f": they tell d^{power:.2g} (n − {n_sample:g}) to {100 * sigma:.2g} %"
+    spheres = count(total, "sphere")
+    return INDEX_UNKNOWN({"number": missing, "spheres": spheres, "best": best}, where=where)
 
 
 AnyFitted = TypeVar("AnyFitted", bound=Fitted)

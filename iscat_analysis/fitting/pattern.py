@@ -85,6 +85,14 @@ class LocalPattern:
 
     inner: tuple[slice, slice]
     still: FloatArray
+    moving: MovingPattern
+
+    def seen(self, frames: slice) -> FloatArray:
+        """Light that frames, relative to the chunk, hold per unit power without particles."""
+        shifts, light = self.moving.pieces(frames)
+        transfer = self.mover.transfer(shifts, light / light.sum())
+        spectrum = self.spectrum + (_time(frames) - self.frame) * self.slope
+        return np.asarray(self.still * self.mover.image(spectrum * transfer)[self.inner])
 
 
 class MovingPattern:
@@ -152,7 +160,7 @@ class MovingPattern:
         blocks, light = self._around(turn), self._block_light
         mean = np.zeros(light.size)
         mean[blocks] = light[blocks] / max(light[blocks].sum(), 1e-300)
-        later = self._time(frames) - self._middle(blocks)
+        later = _time(frames) - self._middle(blocks)
         return np.asarray(mean + later * self._slope_weights(turn) * light)
 
     def local(self, region: Region, frame: int) -> LocalPattern:
@@ -180,16 +188,8 @@ class MovingPattern:
         return LocalPattern(
             mover, np.asarray(spectrum / self._light(frames)), np.asarray(slope),
             self._middle(blocks),
-            (inner[0], inner[1]), self._still[region.slices],
+            (inner[0], inner[1]), self._still[region.slices], self,
         )  # fmt: skip
-
-    def seen(self, pattern: LocalPattern, frames: slice) -> FloatArray:
-        """Light that frames, relative to the chunk, hold per unit power without particles."""
-        shifts, light = self._pieces(frames)
-        transfer = pattern.mover.transfer(shifts, light / light.sum())
-        spectrum = pattern.spectrum + (self._time(frames) - pattern.frame) * pattern.slope
-        moved = pattern.mover.image(spectrum * transfer)[pattern.inner]
-        return np.asarray(pattern.still * moved)
 
     def between(
         self, rows: tuple[int, int], columns: tuple[int, int], before: slice, after: slice
@@ -197,7 +197,7 @@ class MovingPattern:
         """Light after over light before that the motion makes in a region."""
         turn = self.chunk.first + (before.stop + after.start) // 2
         local = self.local(Region(rows, columns), turn)
-        return np.asarray(self.seen(local, after) / self.seen(local, before))
+        return np.asarray(local.seen(after) / local.seen(before))
 
     def _around(self, frame: int) -> slice:
         """Blocks that make the pattern around a frame relative to the chunk."""
@@ -215,7 +215,7 @@ class MovingPattern:
         moments: FloatArray = (self._sums[1:, frames.stop] - self._sums[1:, frames.start]) / light
         return moments
 
-    def _pieces(self, frames: slice) -> tuple[FloatArray, FloatArray]:
+    def pieces(self, frames: slice) -> tuple[FloatArray, FloatArray]:
         """Shift and light of the parts of frames that lie in one block each."""
         edges = self.chunk.edges
         inside = edges[(edges > frames.start) & (edges < frames.stop)]
@@ -228,9 +228,6 @@ class MovingPattern:
         image = mover.spectrum((self.chunk.blocks_e[block] / self._still)[self._nearest])
         back = mover.transfer(-self._blocks[block : block + 1], np.ones(1))
         return (image * back).astype(np.complex64)
-
-    def _time(self, frames: slice) -> float:
-        return float(frames.start + frames.stop - 1) / 2
 
     def _middle(self, blocks: slice) -> float:
         """Mean frame of the light of blocks."""
@@ -308,3 +305,7 @@ class MovingPattern:
 
 def _blocks(edges: NDArray[np.int64]) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in pairwise(edges)]
+
+
+def _time(frames: slice) -> float:
+    return float(frames.start + frames.stop - 1) / 2

@@ -71,7 +71,6 @@ class DetectionResult:
     views: tuple[EventView, ...]
     image: FloatArray
     compared: Compared
-    heading: str
     summary: Mapping[str, Any]
     repeats: tuple[FloatArray, ...] = ()
     empty: EmptySpread | None = None

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import gc
 import hashlib
+import io
 import json
+import math
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,18 +21,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numba.core import event
+from numpy.typing import NDArray
 
 from iscat_analysis import _kernels
 from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, config_to_toml
-from iscat_analysis.executors import Executor
+from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.files import whole_file
 from iscat_analysis.findings import Finding, Findings, existing, remark
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.inference.heights import has_prior
 from iscat_analysis.inference.noise import compile_kernels, parts_of
-from iscat_analysis.reading import npz_of, read_bytes, read_json, read_parquet
-from iscat_analysis.records import FREE_PARAMETERS, Clip, EventView, FloatArray, Progress, Trace
+from iscat_analysis.reading import npz_of, parquet_of, read_bytes, read_json
+from iscat_analysis.records import FREE_PARAMETERS, Clip, EventView, Progress, Trace, silent
 
 PATIENCE_S = 1.0  # of compilation, before it is announced
 _ROOM = f"{_kernels.__name__}."
@@ -91,14 +95,58 @@ def compiling(notify: Callable[[str], None]) -> Iterator[None]:
 RESUMPTION_HINT = "what was finished is kept, and the same command goes on from there"
 """What an interrupt says where it is so."""
 
-_PART = re.compile(r"[0-9a-f]{32}-\d{5}\.(parquet|npz)(\.\d+-[0-9a-f]+\.partial)?")
+_PART = re.compile(r"[0-9a-f]{32}-\d{5}\.npz(\.\d+-[0-9a-f]+\.partial)?")
 _LARGEST_PART_BYTES = 2_000_000_000
-_NO_TRACE = (0.0,) * 9
-_NO_CLIP = (0,) * 4
+_TREE = "tree"  # array that says how the others make a record
+
+
+def packed(record: Any) -> dict[str, Any]:
+    """Pack a record of arrays, tables, tuples, numbers and other records into few arrays.
+
+    Arrays of one type are one after the other; a tree, in JSON, says what lies where.
+    """
+    pools: defaultdict[str, list[NDArray[Any]]] = defaultdict(list)
+    sizes: Counter[str] = Counter()
+
+    def branch(part: Any) -> Any:
+        if isinstance(part, pd.DataFrame):
+            return {"table": branch(np.frombuffer(part.to_parquet(), np.uint8))}
+        if isinstance(part, np.ndarray):
+            kind = part.dtype.name
+            pools[kind].append(part.ravel())
+            sizes[kind] += part.size
+            return {"array": kind, "end": sizes[kind], "shape": part.shape}
+        if is_dataclass(part):
+            own = {one.name: branch(getattr(part, one.name)) for one in fields(part)}
+            return {"record": type(part).__name__, "fields": own}
+        return [branch(each) for each in part] if isinstance(part, tuple) else part
+
+    tree = json.dumps(branch(record), default=lambda number: number.item())
+    return {_TREE: np.array(tree)} | {kind: np.concatenate(pool) for kind, pool in pools.items()}
+
+
+def unpacked(arrays: Mapping[str, NDArray[Any]], records: Iterable[type]) -> Any:
+    """Make the record of packed arrays again; `records` are all classes that are in it."""
+    classes = {each.__name__: each for each in records}
+
+    def grown(part: Any) -> Any:
+        match part:
+            case {"table": columns}:
+                return parquet_of(io.BytesIO(grown(columns).tobytes()))
+            case {"array": kind, "end": end, "shape": shape}:
+                return arrays[kind][end - math.prod(shape) : end].reshape(shape)
+            case {"record": name, "fields": own}:
+                return classes[name](**{key: grown(value) for key, value in own.items()})
+        return tuple(map(grown, part)) if isinstance(part, list) else part
+
+    return grown(json.loads(str(arrays[_TREE])))
 
 
 class Checkpoint:
-    """Tables and arrays of finished parts on disk."""
+    """Records of finished parts on disk."""
+
+    records: tuple[type, ...] = (EventView, Trace, Clip)
+    """Classes of all records that are in a part."""
 
     def __init__(
         self,
@@ -122,105 +170,32 @@ class Checkpoint:
             digest.update(np.asarray(value, dtype=np.float64).tobytes())
         self.key = digest.hexdigest()[:32]
 
-    def read(self, number: int) -> tuple[pd.DataFrame, dict[str, Any]] | None:
-        """Load the table and the arrays of a finished part; None where there are none."""
+    def load(self, number: int) -> Any:
+        """Give the record of a finished part; None where there is none."""
         if self._folder is None:
             return None
-        table_path, path = self._paths(number)
         try:
-            arrays = npz_of(read_bytes(path, _LARGEST_PART_BYTES), (), _LARGEST_PART_BYTES)
-            found = read_parquet(table_path), arrays
-        except (OSError, ValueError):
+            content = read_bytes(self._path(number), _LARGEST_PART_BYTES)
+            found = unpacked(npz_of(content, (), _LARGEST_PART_BYTES), self.records)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
         self.kept += 1
         return found
 
-    def write(self, number: int, table: pd.DataFrame, arrays: Mapping[str, Any]) -> None:
-        """Save a finished part; on a full disk the run goes on, but cannot resume from it."""
+    def save(self, number: int, record: Any) -> None:
+        """Keep a finished part; on a full disk the run goes on, but cannot resume from it."""
         if self._folder is None:
             return
-        table_path, path = self._paths(number)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            table.to_parquet(table_path, index=False)
-            with whole_file(path) as partial, partial.open("wb") as file:
-                np.savez(file, **arrays)
+            with whole_file(self._path(number)) as partial, partial.open("wb") as file:
+                np.savez(file, **packed(record))
             self.kept += 1
         except OSError:
             self._folder = None
 
-    def _paths(self, number: int) -> tuple[Path, Path]:
-        folder = self._folder or Path()
-        stem = f"{self.key}-{number:05d}"
-        return folder / f"{stem}.parquet", folder / f"{stem}.npz"
-
-
-def packed_views(views: Sequence[EventView]) -> dict[str, FloatArray]:
-    """Pack images into arrays for a file."""
-    flat = [np.stack([v.contrast, v.model, v.residual]).reshape(3, -1) for v in views]
-    traces = [v.trace for v in views]
-    clips = [v.clip for v in views]
-    return {
-        "traces": np.concatenate([np.empty(0), *(t.contrast for t in traces if t)]),
-        "trace_marks": np.array([_NO_TRACE if t is None else _marks(t) for t in traces]),
-        "clips": np.concatenate(
-            [np.empty(0, dtype=np.float32), *(c.contrast.ravel() for c in clips if c)]
-        ),
-        "clip_frames": np.array([n for c in clips if c for n in c.frames], dtype=np.int64),
-        "clip_marks": np.array(
-            [_NO_CLIP if c is None else (*c.contrast.shape, c.window_frames) for c in clips]
-        ),
-        "images": np.concatenate(flat or [np.empty((3, 0))], axis=1),
-        "corners": np.array([(v.row_px, v.column_px) for v in views]).reshape(-1, 2),
-        "sizes": np.array([v.contrast.shape for v in views]).reshape(-1, 2),
-    }
-
-
-def unpacked_views(data: Mapping[str, Any]) -> tuple[EventView, ...]:
-    """Unpack images from such arrays."""
-    views, at = [], 0
-    traces, clips = _traces(data), _clips(data)
-    for i, (row, column) in enumerate(data["corners"]):
-        rows, columns = (int(n) for n in data["sizes"][i])
-        stack = data["images"][:, at : at + rows * columns].reshape(3, rows, columns)
-        at += rows * columns
-        views.append(
-            EventView(
-                i, int(row), int(column), stack[0], stack[1], stack[2],
-                trace=next(traces), clip=next(clips),
-            )
-        )  # fmt: skip
-    return tuple(views)
-
-
-def _marks(trace: Trace) -> tuple[float, ...]:
-    """Give the numbers of a trace beside its contrasts."""
-    return (
-        trace.contrast.size, trace.first, trace.sigma, trace.frame, trace.half_width,
-        *trace.used, trace.before, trace.after,
-    )  # fmt: skip
-
-
-def _traces(data: Mapping[str, Any]) -> Iterator[Trace | None]:
-    at = 0
-    for size, first, sigma, frame, half_width, start, stop, before, after in data["trace_marks"]:
-        end = at + int(size)
-        yield None if end == at else Trace(
-            int(first), data["traces"][at:end], float(sigma), int(frame), int(half_width),
-            (int(start), int(stop)), float(before), float(after),
-        )  # fmt: skip
-        at = end
-
-
-def _clips(data: Mapping[str, Any]) -> Iterator[Clip | None]:
-    at, frame = 0, 0
-    for images, rows, columns, window in data["clip_marks"].tolist():
-        end, stop = at + images * rows * columns, frame + images
-        yield None if not images else Clip(
-            tuple(data["clip_frames"][frame:stop].tolist()), window,
-            data["clips"][at:end].reshape(images, rows, columns),
-        )  # fmt: skip
-        at, frame = end, stop
+    def _path(self, number: int) -> Path:
+        return (self._folder or Path()) / f"{self.key}-{number:05d}.npz"
 
 
 def partial_folder(folder: Path) -> Path:
@@ -288,11 +263,11 @@ class Clock:
 class Run:
     """The settings of one run, and the findings that it collects."""
 
-    notify: Notify
-    progress: Progress
-    partial: Path | None
-    executor: Executor
-    inject: int
+    notify: Notify = notify_nobody
+    progress: Progress = silent
+    partial: Path | None = None
+    executor: Executor = field(default_factory=LocalExecutor)
+    inject: int = 0
     clock: Clock = field(default_factory=Clock)
     findings: Findings = field(default_factory=Findings)
 

@@ -107,7 +107,7 @@ def landing_particle_images(
     stride = stride_of(window)
     found: list[BrightStep] = []
     rest: list[BrightStep] = []
-    parts = [part for chunk in plan_parts(reader, config, window, stride) for part in chunk]
+    parts = [part for chunk in plan_parts(reader, config, window) for part in chunk]
     most = enough = MOST_IMAGES if rings else TESTED
     if whole:
         chosen = np.linspace(0, len(parts) - 1, min(len(parts), _PARTS)).round().astype(int)

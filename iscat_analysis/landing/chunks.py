@@ -1,9 +1,18 @@
-"""One chunk of a landing movie: its models, its steps and their fits, in any process."""
+"""One node of work on the chunks of a landing movie, and the runner that cuts and gathers them.
+
+`ChunkNode` finds and fits the steps of one part, a chunk of frames or a tile of one, in any
+process; a part has a margin of frames and pixels beyond its core, so that every step of the core is
+analysed with all its neighbours.  `ChunkRunner` sends parts to where there is room, and merges
+their results.
+"""
 
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
+import threading
+from bisect import bisect_right
+from collections.abc import Generator, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
@@ -11,16 +20,25 @@ from itertools import compress
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.camera import Camera, LightModel, NoiseSpectrum, Trajectory
-from iscat_analysis.config import Config
-from iscat_analysis.diagnosis import misfit_warning
+from iscat_analysis.camera import Camera, LightModel, Trajectory
+from iscat_analysis.config import Config, with_absolute_paths
+from iscat_analysis.diagnosis import Noise, misfit_warning
+from iscat_analysis.executors import Executor
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import posterior_of
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.results import evidence_beside, lines_of, view_of
-from iscat_analysis.fitting.run import Checkpoint, packed_views, unpacked_views
-from iscat_analysis.landing.maps import Searched
-from iscat_analysis.landing.merging import CLIPS, SEAM_PX, VIEWS, FinishedChunk
+from iscat_analysis.fitting.run import Checkpoint
+from iscat_analysis.landing.maps import Searched, maps_are_local
+from iscat_analysis.landing.merging import (
+    CLIPS,
+    SEAM_PX,
+    VIEWS,
+    FinishedChunk,
+    MergedChunks,
+    joined,
+)
+from iscat_analysis.landing.neighbours import Neighbours
 from iscat_analysis.landing.steps import ChunkFitter
 from iscat_analysis.landing.tasks import StepEvent
 from iscat_analysis.records import (
@@ -32,92 +50,22 @@ from iscat_analysis.records import (
     make_rows,
     silent,
 )
-from iscat_analysis.search.chunks import Part, Reader, reader_of
+from iscat_analysis.search.chunks import Part, Reader, plan_parts, reader_of
 from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.frames import EVERYWHERE, Chunk, FieldSums, Tile
 from iscat_analysis.search.sliding import STRIDES, stride_of
-from iscat_analysis.search.templates import ExcessNoise
-from iscat_analysis.threads import threads
+from iscat_analysis.threads import one_thread_algebra, threads
 
+POSTERIORS = 20
+"""Events whose posterior is sampled, where the configuration asks for it."""
 
-class Store(Checkpoint):
-    """Finished chunks of a landing movie on disk."""
-
-    def load(self, number: int) -> FinishedChunk | None:
-        """Give a finished chunk, or None."""
-        found = self.read(number)
-        if found is None:
-            return None
-        lines, data = found
-        try:
-            low, high = (int(n) for n in data["core"])
-            return FinishedChunk(
-                core=(low, high),
-                lines=lines,
-                repeats=data["repeats"],
-                evidence=data["evidence"],
-                views=unpacked_views(data),
-                good=data["good"],
-                light=data["light"],
-                masked=data["masked"],
-                saturated=data["saturated"],
-                strongest=data["strongest"],
-                ends_e=data["ends_e"],
-                trajectory=_trajectory(data["trajectory"]),
-                cause=str(data["cause"]),
-                untold=data["untold"],
-                searched=Searched(data["searched_frames"], data["searched_shares"]),
-                empty=_empty(data["squares"], data["number"], data["shared"]),
-            )
-        except (ValueError, KeyError):
-            return None
-
-    def save(self, number: int, done: FinishedChunk) -> None:
-        """Keep a finished chunk."""
-        searched = done.searched or Searched.joined(())
-        arrays = {
-            "searched_frames": searched.frames,
-            "searched_shares": searched.shares,
-            "core": np.array(done.core),
-            "repeats": done.repeats,
-            "evidence": done.evidence,
-            **packed_views(done.views),
-            "good": done.good,
-            "light": done.light,
-            "masked": done.masked,
-            "saturated": done.saturated,
-            "strongest": done.strongest,
-            "ends_e": done.ends_e,
-            "trajectory": _columns(done.trajectory),
-            "cause": np.array(done.cause),
-            "untold": done.untold,
-            "squares": np.empty(0) if done.empty is None else done.empty.squares,
-            "number": np.empty(0) if done.empty is None else done.empty.counts,
-            "shared": np.empty(0) if done.empty is None else done.empty.shared,
-        }
-        self.write(number, done.lines, arrays)
-
-
-def _columns(motion: Trajectory | None) -> FloatArray:
-    if motion is None:
-        return np.empty((0, 5))
-    return np.column_stack([motion.frames, motion.shift_px, motion.error_px])
-
-
-def _empty(squares: FloatArray, counts: FloatArray, shared: FloatArray) -> EmptySpread | None:
-    return EmptySpread(squares, counts, shared) if counts.size else None
-
-
-def _trajectory(columns: FloatArray) -> Trajectory | None:
-    return Trajectory(columns[:, 0], columns[:, 1:3], columns[:, 3:]) if len(columns) else None
-
-
+_FIELDS = 2  # chunks whose sums over the field are kept: one ends while the next begins
 _LARGEST_SHARE = 1.5  # times its share of the field, that a tile may have of the events shown
 
 
 @dataclass(frozen=True)
-class ChunkSetting:
-    """What all chunks of a movie share, so that any process can read and analyse one."""
+class ChunkNode:
+    """The work on every part of a movie, which any process can do."""
 
     frames: CountSource
     camera: Camera
@@ -125,26 +73,73 @@ class ChunkSetting:
     span: tuple[int, int]
     searches: int
     window: int
-    noise: NoiseSpectrum | None
-    excess_noise: ExcessNoise | None
+    noise: Noise
     lines: LightModel | None
+    opened: Reader | None = None  # of this process
+
+    def __reduce__(self) -> tuple[type[ChunkNode], tuple[object, ...]]:
+        """Leave behind what is open, and models that are made again as quickly."""
+        config = with_absolute_paths(self.config)
+        shared = self.span, self.searches, self.window, self.noise, self.lines
+        return ChunkNode, (self.frames, self.camera, config, *shared)
 
     @cached_property
     def reader(self) -> Reader:
         """The frames, for one chunk after the other."""
-        return reader_of(self.frames, self.config, self.camera, self.span)
+        return self.opened or reader_of(self.frames, self.config, self.camera, self.span)
 
     @cached_property
     def context(self) -> AnalysisContext:
         """The models, which all chunks share."""
-        return make_context(
-            self.config, self.reader.shape, searches=self.searches, noise=self.noise,
-            lines=self.lines, sliding=True,
+        with one_thread_algebra():
+            return make_context(
+                self.config, self.reader.shape, searches=self.searches, noise=self.noise.spectrum,
+                lines=self.lines, sliding=True,
+            )  # fmt: skip
+
+    def plan(self, stretch: tuple[int, int]) -> list[list[Part]]:
+        """Divide a stretch of the movie into chunks, and these into tiles where they are large."""
+        moving = self.config.background.follows_pattern
+        in_place = maps_are_local(self.context, moving=moving)
+        return plan_parts(self.reader, self.config, self.window, stretch, in_place=in_place)
+
+    def analyse(
+        self,
+        part: Part,
+        sums: FieldSums | None,
+        posteriors: int,
+        earlier: int,
+        pool: ThreadPoolExecutor,
+        *,
+        progress: Progress = silent,
+    ) -> FinishedChunk:
+        """Read and analyse a part, of which `sums` say what the field has where it is a tile."""
+        context, stride = self.context, stride_of(self.window)
+        if part.tile is None or sums is None:
+            chunk = self.reader.chunk(part.span, stride, pool)
+        else:
+            chunk = self.reader.tile_chunk(sums, part.tile, stride, pool)
+            context = context.on_tile(part.tile)
+        progress("landing", 0, 1)
+        still, pattern = corrected(
+            chunk, wanted=self.config.background.follows_pattern, mapper=pool.map
+        )
+        own = EVERYWHERE if part.tile is None else part.tile.inner
+        fitter = ChunkFitter(
+            Neighbours(context, still, self.window, pattern), pool, self.noise.excess, own,
+            controlled=part.controlled,
         )  # fmt: skip
+        return analyse_chunk(fitter, chunk, part, posteriors, earlier)
+
+
+class ChunkStore(Checkpoint):
+    """Finished parts of a landing movie on disk."""
+
+    records = (*Checkpoint.records, FinishedChunk, Trajectory, EmptySpread, Searched)
 
 
 def chunk_job(
-    setting: ChunkSetting,
+    node: ChunkNode,
     part: Part,
     sums: FieldSums | None,
     posteriors: int,
@@ -152,65 +147,132 @@ def chunk_job(
     *,
     progress: Progress = silent,
 ) -> FinishedChunk:
-    """Open the movie and analyse one chunk, or one tile of it."""
-    with threads(setting.config.compute.workers) as pool:
-        return analyse_part(
-            setting.reader, setting.context, part, sums, setting.window, pool, posteriors,
-            setting.excess_noise, earlier, progress=progress,
-        )  # fmt: skip
+    """Open the movie and analyse one part of it."""
+    with threads(node.config.compute.workers) as pool:
+        return node.analyse(part, sums, posteriors, earlier, pool, progress=progress)
 
 
-def field_job(
-    setting: ChunkSetting, span: tuple[int, int], *, progress: Progress = silent
-) -> FieldSums:
+def field_job(node: ChunkNode, span: tuple[int, int], *, progress: Progress = silent) -> FieldSums:
     """Open the movie and sum the frames of a chunk over the field."""
     del progress
-    with threads(setting.config.compute.workers) as pool:
-        return setting.reader.field_sums(span, pool)
+    with threads(node.config.compute.workers) as pool:
+        return node.reader.field_sums(span, pool)
 
 
-def analyse_part(
-    reader: Reader,
-    context: AnalysisContext,
-    part: Part,
-    sums: FieldSums | None,
-    window: int,
-    pool: ThreadPoolExecutor,
-    posteriors: int,
-    excess_noise: ExcessNoise | None,
-    earlier: int,
-    *,
-    progress: Progress = silent,
-) -> FinishedChunk:
-    """Read and analyse a chunk, or one tile of it, of which `sums` say what the field has."""
-    if part.tile is None or sums is None:
-        chunk = reader.chunk(part.span, stride_of(window), pool)
-    else:
-        chunk = reader.tile_chunk(sums, part.tile, stride_of(window), pool)
-        context = context.on_tile(part.tile)
-    progress("landing", 0, 1)
-    return analyse_chunk(context, chunk, part, window, pool, posteriors, excess_noise, earlier)
+class ChunkRunner:
+    """Does the work of a node on all parts of a movie, where there is room, and merges it."""
+
+    def __init__(
+        self,
+        node: ChunkNode,
+        stretches: Sequence[tuple[int, int]],
+        executor: Executor,
+        store: ChunkStore,
+    ) -> None:
+        self.node, self._executor, self._store = node, executor, store
+        self.chunks = [chunk for stretch in stretches for chunk in node.plan(stretch)]
+        self._parts = [part for chunk in self.chunks for part in chunk]
+        self._edges: list[int] = np.cumsum([0, *map(len, self.chunks)]).tolist()
+        self._samples = node.config.samples_posterior
+        self.merged = MergedChunks(node.reader.shape, [stop for _, stop in stretches])
+        self._fields: dict[tuple[int, int], Future[FieldSums]] = {}
+        self._lock = threading.Lock()
+
+    def run(self) -> Generator[tuple[int, bool]]:
+        """Merge parts in order, in whatever order they come.
+
+        Yields the number of frames that are done, and whether it stopped within a chunk.
+        """
+        workers, executor = self.node.config.compute.workers, self._executor
+        waiting: dict[int, FinishedChunk] = {}
+        ready, frames = 0, 0.0
+        with threads(executor.threads(workers, len(self._parts))) as pool:
+            try:
+                for number, done in self._results(pool):
+                    waiting[number] = done
+                    self.merged.note(number, done)
+                    home = bisect_right(self._edges, number) - 1
+                    frames += (done.core[1] - done.core[0]) / len(self.chunks[home])
+                    while ready < len(self.chunks):
+                        own = range(*self._edges[ready : ready + 2])
+                        if not all(k in waiting for k in own):
+                            break
+                        parts = [waiting.pop(k) for k in own]
+                        tiles = [part.tile for part in self.chunks[ready] if part.tile is not None]
+                        self.merged.add(joined(tiles, parts) if tiles else parts[0])
+                        ready += 1
+                    yield round(frames), done.stopped
+            except KeyboardInterrupt:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+
+    def _results(self, pool: ThreadPoolExecutor) -> Iterator[tuple[int, FinishedChunk]]:
+        """Finish parts; with posteriors one follows another, and has what is left to sample."""
+        count, alone = len(self._parts), 0
+        while self._samples and alone < count and self.merged.sampled < POSTERIORS:
+            yield alone, self._finish(alone, pool)
+            alone += 1
+        later = self._executor.each(lambda number: self._finish(number, pool), range(alone, count))
+        for number, done in later:
+            yield alone + number, done
+
+    def _finish(self, number: int, pool: ThreadPoolExecutor) -> FinishedChunk:
+        """Load a part that was finished before, or analyse it."""
+        node, merged, executor = self.node, self.merged, self._executor
+        known: FinishedChunk | None = None if self._samples else self._store.load(number)
+        if known is None:
+            part = self._parts[number]
+            budget = POSTERIORS - merged.sampled if self._samples else 0
+            earlier = merged.earlier(number, part.core[0] - node.window)  # before all of this chunk
+            if executor.distant:
+                node.reader.forget()  # whoever does it has a reader of its own
+            sums = None
+            if part.tile is not None:
+                sums = self._sums(part.span, pool).part(part.tile.here)
+                chunk = bisect_right(self._edges, number)  # the next one
+                is_last_but_one = number == self._edges[chunk] - 2
+                if node.reader.in_place and is_last_but_one and chunk < len(self.chunks):
+                    # while another process does the other tiles
+                    self._sums(self.chunks[chunk][0].span, pool)
+            arguments = part, sums, budget, earlier
+            known = executor.call(
+                chunk_job, node, *arguments, here=lambda: node.analyse(*arguments, pool)
+            )
+            self._store.save(number, replace(known, views=_without_posteriors(known.views)))
+        merged.note(number, known)
+        return known
+
+    def _sums(self, span: tuple[int, int], pool: ThreadPoolExecutor) -> FieldSums:
+        """Give sums over the field, made once for all tiles of a chunk; the last few are kept."""
+        with self._lock:
+            known = self._fields.get(span)
+            mine: Future[FieldSums] = Future()
+            if known is None:
+                for old in sorted(self._fields)[: 1 - _FIELDS]:
+                    del self._fields[old]
+                self._fields[span] = mine
+        if known is None:
+            node = self.node
+            try:
+                mine.set_result(
+                    self._executor.call(
+                        field_job, node, span, here=lambda: node.reader.field_sums(span, pool)
+                    )
+                )
+            except BaseException as error:
+                mine.set_exception(error)
+                raise
+        return (known or mine).result()
 
 
 def analyse_chunk(
-    context: AnalysisContext,
-    chunk: Chunk,
-    part: Part,
-    window: int,
-    pool: ThreadPoolExecutor,
-    posteriors: int,
-    excess_noise: ExcessNoise | None,
-    earlier: int,
+    fitter: ChunkFitter, chunk: Chunk, part: Part, posteriors: int, earlier: int
 ) -> FinishedChunk:
     """Find and fit every step of a chunk, or of a tile of one; places are those of the field."""
-    core, tile = part.core, part.tile
-    wanted = context.config.background.follows_pattern
-    still, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
-    own = EVERYWHERE if tile is None else tile.inner
-    fitter = ChunkFitter(
-        context, still, window, pool, pattern, excess_noise=excess_noise, own=own,
-        controlled=part.controlled,
-    )  # fmt: skip
+    neighbours, mapper = fitter.neighbours, fitter.mapper
+    context, window, still = neighbours.context, neighbours.window, neighbours.chunk
+    core, tile, own = part.core, part.tile, fitter.own
+    corner = (0, 0) if tile is None else tile.corner
     inside = slice(core[0] - chunk.first, core[1] - chunk.first)
     ends = _ends(chunk, inside) if {*core} & {*part.span} else []  # maps take the place of blocks
     seam = max(2, window // STRIDES)
@@ -234,27 +296,25 @@ def analyse_chunk(
         steps[: _shown_of(tile, VIEWS - earlier)], _shown_of(tile, CLIPS - earlier)
     )
     found = [one.step for one in steps]
-    empty_ends = [
-        (mean_e / fitter.neighbours.light_in(frames, found))[own] for frames, mean_e in ends
-    ]
-    light = np.where(chunk.good, chunk.power, np.nan) * chunk.level_e
-    lines = make_rows(lines_of(context, events, mapper=pool.map))
-    corner = (0, 0) if tile is None else tile.corner
+    empty_ends = [(mean_e / neighbours.light_in(frames, found))[own] for frames, mean_e in ends]
+    light = np.where(still.good, still.power, np.nan) * still.level_e
+    lines = make_rows(lines_of(context, events, mapper=mapper))
+    pattern = neighbours.pattern
     return FinishedChunk(
         core=core,
         lines=_moved(lines, corner, context.pixel_nm),
         repeats=np.array([step.repeats for step in steps]),
-        evidence=evidence_beside(context, events, mapper=pool.map),
+        evidence=evidence_beside(context, events, mapper=mapper),
         views=tuple(
             view_moved(
                 view_of(n, events[n], posterior=chains.get(n), trace=trace, clip=clip), corner
             )
             for n, (trace, clip) in enumerate(shown)
         ),
-        good=chunk.good[inside].copy(),
+        good=still.good[inside].copy(),
         light=light[inside],
         masked=~chunk.usable[own],
-        saturated=chunk.saturated[own].copy(),
+        saturated=still.saturated[own].copy(),
         strongest=fitter.strongest[(slice(None), *own)].copy(),  # not held with its halo
         ends_e=np.array(empty_ends, dtype=np.float32),
         sampled=len(chains),
@@ -265,6 +325,11 @@ def analyse_chunk(
         searched=fitter.searched,
         untold=np.array([step.told for step in steps if step.told]).reshape(-1, 2),
     )
+
+
+def _without_posteriors(views: Sequence[EventView]) -> tuple[EventView, ...]:
+    """Leave out chains, which are sampled again."""
+    return tuple(replace(view, posterior=None) for view in views)
 
 
 def _shown_of(tile: Tile | None, left: int) -> int:

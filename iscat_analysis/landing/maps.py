@@ -25,10 +25,9 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.sliding import near_earlier_peaks
 from iscat_analysis._kernels.stepping import add_image
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.pattern import MovingPattern
 from iscat_analysis.landing.neighbours import Neighbours, Step
 from iscat_analysis.records import FloatArray, Mapper
-from iscat_analysis.search.frames import EVERYWHERE, Box, Chunk
+from iscat_analysis.search.frames import EVERYWHERE, Box
 from iscat_analysis.search.peaks import EXCEEDS, EXPLAINS, RINGS, is_hidden, size_on_ring
 from iscat_analysis.search.sliding import STRIDES, Filter, MapArray, Peak, sliding_maps
 from iscat_analysis.search.templates import FAR_LOBE, LARGEST_IMAGE, NEAR, SIDELOBE
@@ -37,17 +36,10 @@ from iscat_analysis.search.templates import FAR_LOBE, LARGEST_IMAGE, NEAR, SIDEL
 class StepMaps:
     """The maps of one chunk, updated from search to search."""
 
-    def __init__(
-        self,
-        context: AnalysisContext,
-        chunk: Chunk,
-        matched: Filter,
-        neighbours: Neighbours,
-        pattern: MovingPattern | None = None,
-    ) -> None:
-        self._context, self._chunk, self.matched = context, chunk, matched
-        self._neighbours, self._pattern = neighbours, pattern
-        self.is_local = maps_are_local(context, moving=pattern is not None)
+    def __init__(self, neighbours: Neighbours, matched: Filter) -> None:
+        self._context, self._chunk = neighbours.context, neighbours.chunk
+        self._neighbours, self._pattern, self.matched = neighbours, neighbours.pattern, matched
+        self.is_local = maps_are_local(self._context, moving=self._pattern is not None)
         self._maps: tuple[MapArray, FloatArray] | None = None
         self._known: list[Step] = []
         self._near: list[list[Step]] = []  # of those known, which were taken off each map
@@ -238,9 +230,6 @@ class SidelobeFilter:
 LEVELS = np.geomspace(1.0, 64.0, 25)
 """Signal-to-noise ratios, in thresholds, at which the share of the places is kept."""
 
-LEAST_SHARE = 0.95
-"""Share of field and time below which it is said in words."""
-
 _RING_STEP_PX = 4.0
 _WHOLE = 0.999  # share from which a boundary counts as searched
 
@@ -285,20 +274,17 @@ class Searched:
 
 
 def searched_shares(
-    chunk: Chunk,
+    neighbours: Neighbours,
     core: tuple[int, int],
     steps: Sequence[Step],
     peaks: Sequence[Peak],
     maps: tuple[MapArray, FloatArray],
-    *,
-    window: int,
-    roi_px: int,
-    threshold: float,
     own: Box = EVERYWHERE,
 ) -> Searched:
     """Give the shares at the boundaries of a core, from the last search and what was found."""
     snr, effective = maps
-    stride = int(chunk.edges[1] - chunk.edges[0])
+    chunk, window, stride = neighbours.chunk, neighbours.window, neighbours.stride
+    roi_px, threshold = neighbours.roi_px, neighbours.context.templates.threshold
     frames = chunk.first + chunk.edges[1:-1]
     lit = effective > 0  # frames, and pixels, that were left out are told by themselves
     inside = np.flatnonzero((frames >= core[0]) & (frames < core[1]) & lit)
@@ -346,18 +332,3 @@ def _raise_near_fitted(
     left = np.interp(away, radii, rings, right=0.0)
     np.maximum(left, np.where(away < roi_px / 2, inside, 0.0), out=left)
     np.maximum(asked, left, out=asked)
-
-
-def searched_warning(name: str, summary: dict[str, Any]) -> str:
-    """Say that a part of the movie was not searched; empty where nearly all was."""
-    share = summary["searched_share"]
-    if share is None or share >= LEAST_SHARE:
-        return ""
-    spans = sorted(summary["partly_searched"], key=lambda span: span[2])[:3]
-    worst = ", ".join(f"{start}:{stop} ({part:.0%})" for start, stop, part in sorted(spans))
-    return (
-        f"{name}: {share:.0%} of field and time were searched for particles with a signal-to-noise "
-        f"ratio of {summary['searched_snr']:.0f}; what bright or ill-described particles left over "
-        f"hides the rest, most in frames {worst}; numbers of particles and rates are corrected "
-        "for it, but look at these frames"
-    )

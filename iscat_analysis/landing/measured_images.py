@@ -48,18 +48,17 @@ _LEAST_MISFIT_SHARE = 0.1  # share of a misfit that alone passes the threshold w
 _LARGEST_SHIFT_SHARE = 0.35
 
 
-def large_steps(
-    context: AnalysisContext, chunk: Chunk, window: int, neighbours: Neighbours, mapper: Mapper
-) -> list[Step]:
+def large_steps(neighbours: Neighbours, mapper: Mapper) -> list[Step]:
     """Find bright steps that a sphere describes and a dipole does not."""
+    context, chunk = neighbours.context, neighbours.chunk
     if not context.spheres_of(context.model):
         return []
     optics = context.config.optics
     _, bright = find_bright_steps(
-        chunk, window, pixel_nm=context.pixel_nm, resolution_nm=optics.wavelength_nm / optics.na,
+        chunk, neighbours.window, pixel_nm=context.pixel_nm,
+        resolution_nm=optics.wavelength_nm / optics.na,
         roi_px=context.roi_px, most=0, mapper=mapper,
     )  # fmt: skip
-    stride = int(chunk.edges[1] - chunk.edges[0])
     steps: list[Step] = []
     vain = 0
     for step in bright:
@@ -82,7 +81,7 @@ def large_steps(
                 found.append((sign, *sphere))
         if found:
             sign, seated, fit = max(found, key=lambda one: one[2].log_likelihood)
-            at = StepFrame.undated(step.frame, stride)
+            at = StepFrame.undated(step.frame, neighbours.stride)
             steps.append(neighbours.draw_sphere(sign, at, model_of(seated), fit))
             vain = 0
     return steps
@@ -119,19 +118,14 @@ def _middle(span: tuple[int, int], most: int) -> tuple[int, int]:
 
 
 def with_measured_images(
-    steps: Sequence[Step],
-    near: Sequence[Sequence[int]],
-    chunk: Chunk,
-    neighbours: Neighbours,
-    window: int,
-    threshold: float,
-    roi_px: int,
+    steps: Sequence[Step], near: Sequence[Sequence[int]], neighbours: Neighbours
 ) -> list[Step]:
     """Give those steps their measured pictures of which what is left over could hide others.
 
     Two lobes of one picture that the model does not describe may both have been taken for steps:
     the weaker one is left out.
     """
+    threshold = neighbours.context.templates.threshold
     chosen: list[int] = []
     lobes: set[int] = set()
     # those that are measured come first, then those of which the model leaves over most
@@ -141,7 +135,7 @@ def with_measured_images(
         sphere = neighbours.are_spheres or step.sphere is not None
         if not (step.is_measured or _hides_others(step, threshold, sphere=sphere)):
             continue
-        middle = next((steps[k] for k in chosen if _is_lobe(step, steps[k], window, roi_px)), None)
+        middle = next((steps[k] for k in chosen if _is_lobe(step, steps[k], neighbours)), None)
         if middle is None:
             chosen.append(i)
         elif not middle.is_measured:
@@ -150,7 +144,7 @@ def with_measured_images(
     for _ in range(_PASSES):
         for i in chosen:
             others = [measured[k] for k in near[i] if k not in lobes]
-            measured[i] = _measured(measured[i], others, chunk, neighbours, window, roi_px)
+            measured[i] = _measured(measured[i], others, neighbours)
     return [step for i, step in enumerate(measured) if i not in lobes]
 
 
@@ -169,22 +163,16 @@ def _hides_others(step: Step, threshold: float, *, sphere: bool) -> bool:
     return step.excess > max(_MUCH * step.snr**2, (threshold / _LEAST_MISFIT_SHARE) ** 2)
 
 
-def _is_lobe(step: Step, brighter: Step, window: int, roi_px: int) -> bool:
+def _is_lobe(step: Step, brighter: Step, neighbours: Neighbours) -> bool:
     """Whether a step is in the middle of the picture of a brighter step, at the same time."""
-    near = distance_px(step, brighter) < 2 * _LARGEST_SHIFT_SHARE * roi_px
-    return near and abs(step.at.frame - brighter.at.frame) <= window // STRIDES
+    near = distance_px(step, brighter) < 2 * _LARGEST_SHIFT_SHARE * neighbours.roi_px
+    return near and abs(step.at.frame - brighter.at.frame) <= neighbours.window // STRIDES
 
 
-def _measured(
-    step: Step,
-    others: Sequence[Step],
-    chunk: Chunk,
-    neighbours: Neighbours,
-    window: int,
-    roi_px: int,
-) -> Step:
+def _measured(step: Step, others: Sequence[Step], neighbours: Neighbours) -> Step:
     """Replace the picture of a step by the measured one, if there are frames for that."""
-    rows, columns = ((part.start, part.stop) for part in neighbours.box(step))
+    chunk, window, roi_px = neighbours.chunk, neighbours.window, neighbours.roi_px
+    rows, columns = step.drawn.rows, step.drawn.columns
     frame, gap = step.at.frame, min(step.at.gap, window // 5)
     begin, end = max(frame - window, chunk.first), min(frame + window, chunk.stop)
     spans = (begin, max(frame - gap, begin)), (min(frame + gap, end), end)

@@ -1,8 +1,8 @@
-"""Finished chunks of a landing movie, joined from tiles and merged: each event once, by frame.
+"""Finished parts of a landing movie, put together: each event once, in order of frame.
 
-An event belongs to the tile whose core holds its centre.  On a seam two tiles may each place it in
-the other's core, or each in its own: of what one reports beyond its core, that is kept which no
-other reports.
+An event belongs to the part whose core, of frames and of pixels, holds it.  On a seam two parts may
+each place it in the other's core, or each in its own: of what one reports beyond its core, that is
+kept which no other reports.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -39,12 +40,12 @@ SEAM_PX = 2.0
 
 @dataclass(frozen=True)
 class FinishedChunk:
-    """The results of a chunk that are kept."""
+    """The results of a chunk, or of a tile of one, that are kept."""
 
     core: tuple[int, int]
     lines: pd.DataFrame  # of fits.csv, which have no numbers yet
     repeats: FloatArray  # of every row, from `iscat_analysis.inference.split_frames`
-    views: tuple[EventView, ...]
+    views: tuple[EventView, ...]  # of the first rows
     good: BoolArray  # of the core
     light: FloatArray
     masked: BoolArray
@@ -61,6 +62,103 @@ class FinishedChunk:
     )  # of every row
     searched: Searched | None = None  # share of the field at each boundary
     untold: FloatArray = field(default_factory=lambda: np.empty((0, 2)))  # `Told` of some rows
+
+
+def joined(tiles: Sequence[Tile], done: Sequence[FinishedChunk]) -> FinishedChunk:
+    """Join the tiles of one chunk."""
+    rows = _Rows(done)
+    kept = rows.nothing
+    if len(rows.table):
+        y, x = (rows.table[name].to_numpy(float) for name in ("y_px", "x_px"))
+        own = np.zeros(len(rows.table), dtype=np.bool_)
+        for number, tile in enumerate(tiles):
+            own |= (rows.home == number) & tile.holds(y, x)
+        same = SameSteps(rows.table)
+        chosen = np.flatnonzero(same.with_strangers(own, ~own))
+        # two of one particle, each in its own core: the clearer one is kept
+        clear = np.argsort(-rows.table["snr"].to_numpy(float)[chosen], kind="stable")
+        for one in chosen[clear].tolist():
+            others = same.like(one)
+            kept[one] = not (kept[others] & (rows.home[others] != rows.home[one])).any()
+    lines, repeats, evidence, views = rows.gathered(kept)
+    has_ends = done[0].ends_e.size > 0
+    middle = next(part for tile, part in zip(tiles, done, strict=True) if tile.is_central)
+    return replace(
+        done[0],
+        lines=lines if len(rows.table) else done[0].lines,
+        repeats=np.array(repeats),
+        evidence=evidence,
+        views=tuple(view for view in takewhile(lambda view: view is not None, views) if view),
+        masked=_field(tiles, [part.masked for part in done]),
+        saturated=_field(tiles, [part.saturated for part in done]),
+        strongest=_field(tiles, [part.strongest for part in done]),
+        ends_e=_field(tiles, [part.ends_e for part in done]) if has_ends else done[0].ends_e,
+        sampled=sum(part.sampled for part in done),
+        stopped=any(part.stopped for part in done),
+        trajectory=middle.trajectory,
+        cause=next((part.cause for part in done if part.cause), ""),
+        empty=EmptySpread.beside([part.empty for part in done]),
+        searched=_searched(done),
+        untold=np.concatenate([part.untold for part in done]),
+    )
+
+
+def _field(tiles: Sequence[Tile], parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Put the cores of tiles in their places.
+
+    Shapes: `parts` (…, y, x), result (…, y, x).
+    """
+    whole = np.zeros((*parts[0].shape[:-2], *tiles[0].field), dtype=parts[0].dtype)
+    for tile, part in zip(tiles, parts, strict=True):
+        whole[(..., *tile.core)] = part
+    return whole
+
+
+def _searched(done: Sequence[FinishedChunk]) -> Searched | None:
+    """Average the shares of tiles, by their pixels."""
+    known = [(part.searched, np.count_nonzero(~part.masked)) for part in done if part.searched]
+    if not known:
+        return None
+    pixels = np.maximum([number for _, number in known], 1.0)
+    shares = np.stack([searched.shares for searched, _ in known])
+    return Searched(known[0][0].frames, np.average(shares, axis=0, weights=pixels))
+
+
+class _Rows:
+    """The rows of several parts, one after the other."""
+
+    def __init__(self, parts: Sequence[FinishedChunk]) -> None:
+        self._parts = parts
+        counts = [len(part.lines) for part in parts]
+        self.home = np.repeat(np.arange(len(parts)), counts)
+        self._row = np.concatenate([np.arange(0), *map(np.arange, counts)])
+        tables = [part.lines for part in parts if len(part.lines)]
+        self.table = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
+
+    @property
+    def nothing(self) -> BoolArray:
+        """A mark for each row, none of which is set."""
+        return np.zeros(self.home.size, dtype=np.bool_)
+
+    def gathered(
+        self, kept: BoolArray
+    ) -> tuple[pd.DataFrame, tuple[FloatArray, ...], FloatArray, list[EventView | None]]:
+        """Give rows in order of frame, and their repeats, evidence and views, None of some.
+
+        Shapes: `kept` (n,).
+        """
+        order: list[int] = []
+        if len(self.table):
+            frame, y, x = (self.table[name].to_numpy(float) for name in ("frame", "y_nm", "x_nm"))
+            order = sorted(np.flatnonzero(kept).tolist(), key=lambda i: (frame[i], y[i], x[i]))
+        homes = [(self._parts[self.home[i]], int(self._row[i])) for i in order]
+        evidence = np.array([part.evidence[row] for part, row in homes]).reshape(-1, len(NOTHING))
+        views: list[EventView | None] = []
+        for number, (part, row) in enumerate(homes[:VIEWS]):
+            view = replace(part.views[row], event=number) if row < len(part.views) else None
+            views.append(replace(view, clip=None) if view and number >= CLIPS else view)
+        table = self.table.iloc[order].reset_index(drop=True)
+        return table, tuple(part.repeats[row] for part, row in homes), evidence, views
 
 
 class MergedChunks:
@@ -114,35 +212,22 @@ class MergedChunks:
     @property
     def image(self) -> FloatArray:
         """Amplitude of the strongest step of each pixel."""
-        image: FloatArray = self._strongest[1].astype(np.float64)
-        return image
+        return np.asarray(self._strongest[1], dtype=np.float64)
 
     def result(self) -> tuple[pd.DataFrame, tuple[EventView, ...], tuple[FloatArray, ...]]:
         """Events of all chunks, each once, numbered in order of frame; their views and repeats."""
-        homes = [(done, row) for done in self._done for row in range(len(done.lines))]
-        if not homes:
+        rows = _Rows(self._done)
+        if not len(rows.table):
             return make_rows([], {"event": [], FRAME_COLUMN: []}), (), ()
-        table = pd.concat([d.lines for d in self._done if len(d.lines)], ignore_index=True)
-        cores = np.array([done.core for done, _ in homes])
-        frame = table["frame"].to_numpy()
-        own = (frame >= cores[:, 0]) & (frame < cores[:, 1])
-        finished = np.zeros(len(table), dtype=np.bool_)
-        for done in self._done:
-            finished |= (frame >= done.core[0]) & (frame < done.core[1])
-        kept = SameSteps(table).with_strangers(own, ~own & finished)
-        y, x = (table[name].to_numpy(float) for name in ("y_nm", "x_nm"))
-        order = sorted(np.flatnonzero(kept).tolist(), key=lambda i: (frame[i], y[i], x[i]))
-        views, repeats = [], []
-        for number, i in enumerate(order):
-            done, row = homes[i]
-            repeats.append(done.repeats[row])
-            if number < VIEWS and row < len(done.views):
-                view = replace(done.views[row], event=number)
-                views.append(view if number < CLIPS else replace(view, clip=None))
-        evidence = [homes[i][0].evidence[homes[i][1]] for i in order]
-        self.evidence = np.array(evidence).reshape(-1, len(NOTHING))
-        rows = make_rows(table.iloc[order], {"event": range(len(order))})
-        return rows, tuple(views), tuple(repeats)
+        frame, own, finished = rows.table["frame"].to_numpy(), rows.nothing, rows.nothing
+        for number, done in enumerate(self._done):
+            inside = (frame >= done.core[0]) & (frame < done.core[1])
+            own |= inside & (rows.home == number)
+            finished |= inside
+        kept = SameSteps(rows.table).with_strangers(own, ~own & finished)
+        table, repeats, self.evidence, views = rows.gathered(kept)
+        table = make_rows(table, {"event": range(len(table))})
+        return table, tuple(view for view in views if view is not None), repeats
 
     def searched(self) -> Searched:
         """Which part of field and time was searched."""
@@ -173,12 +258,8 @@ class MergedChunks:
         """Light of the finished frames; NaN where one was left out."""
         return self._in_place([done.light for done in self._done], np.nan)
 
-    def left_out(self) -> int:
-        """Frames that are zero or repeat the one before."""
-        return int(sum(np.count_nonzero(~d.good) for d in self._done))
-
-    def repeats(self) -> NDArray[np.int64]:
-        """Frames left out, counted from the first of the movie's part that was read."""
+    def left_out(self) -> NDArray[np.int64]:
+        """Frames that are zero or repeat the one before, from the first that was read."""
         good = self._in_place([done.good for done in self._done], True)
         return np.flatnonzero(~good.astype(np.bool_))
 
@@ -232,15 +313,14 @@ class MergedChunks:
         dy, dx = np.sum(moved, axis=0).tolist()
         return [dy, dx] if math.isfinite(dy) and math.isfinite(dx) else None
 
+    def masks(self) -> tuple[int, int]:
+        """Defective and saturated pixels."""
+        return int((self._masked & ~self._saturated).sum()), int(self._saturated.sum())
+
     @property
     def masked_pixels(self) -> int:
         """Pixels that are not used in some chunk."""
         return int(self._masked.sum())
-
-    def masks(self) -> tuple[int, int]:
-        """Defective and saturated pixels."""
-        defective = self._masked & ~self._saturated
-        return int(defective.sum()), int(self._saturated.sum())
 
 
 class SameSteps:
@@ -255,15 +335,15 @@ class SameSteps:
         self._dated = self._frame[self._order]
         self._largest = float(np.nanmax(self._error, initial=0.0))
 
-    def like(self, one: int) -> NDArray[np.int64]:
-        """Give the other rows that describe the step of one."""
-        frame, error = self._frame[one], self._error[one]
+    def like(self, row: int) -> NDArray[np.int64]:
+        """Give the other rows that describe the same step as a row."""
+        frame, error = self._frame[row], self._error[row]
         reach = max(2.0, error + self._largest)
         first, last = np.searchsorted(self._dated, (frame - reach, frame + reach + 1e-9))
         others: NDArray[np.int64] = self._order[first:last]
         near = np.abs(self._frame[others] - frame) <= np.maximum(2, self._error[others] + error)
-        away = np.hypot(self._x[others] - self._x[one], self._y[others] - self._y[one])
-        near &= (away < SEAM_PX) & (self._mass[others] * self._mass[one] > 0) & (others != one)
+        away = np.hypot(self._x[others] - self._x[row], self._y[others] - self._y[row])
+        near &= (away < SEAM_PX) & (self._mass[others] * self._mass[row] > 0) & (others != row)
         return np.asarray(others[near])
 
     def with_strangers(self, own: BoolArray, strangers: BoolArray) -> BoolArray:
@@ -272,90 +352,6 @@ class SameSteps:
         Shapes: `own, strangers` (n,), result (n,).
         """
         kept = own.copy()
-        for one in np.flatnonzero(strangers).tolist():
-            kept[one] = not kept[self.like(one)].any()
+        for row in np.flatnonzero(strangers).tolist():
+            kept[row] = not kept[self.like(row)].any()
         return kept
-
-
-def joined(tiles: Sequence[Tile], done: Sequence[FinishedChunk]) -> FinishedChunk:
-    """Join the tiles of one chunk."""
-    homes = [(part, row) for part in done for row in range(len(part.lines))]
-    order = _own_rows(tiles, done)
-    lines = done[0].lines
-    if homes:
-        table = pd.concat([part.lines for part in done if len(part.lines)], ignore_index=True)
-        lines = table.iloc[order].reset_index(drop=True)
-    chosen = [homes[i] for i in order]
-    views: list[EventView] = []
-    for number, (part, row) in enumerate(chosen):
-        if row >= len(part.views):  # it has so many that the others are not shown
-            break
-        view = part.views[row]
-        views.append(view if number < CLIPS else replace(view, clip=None))
-    has_ends = done[0].ends_e.size > 0
-    middle = next(part for tile, part in zip(tiles, done, strict=True) if tile.is_central)
-    return replace(
-        done[0],
-        lines=lines,
-        repeats=np.array([part.repeats[row] for part, row in chosen]),
-        evidence=np.array([part.evidence[row] for part, row in chosen]).reshape(
-            -1, done[0].evidence.shape[1]
-        ),
-        views=tuple(views),
-        masked=_field(tiles, [part.masked for part in done]),
-        saturated=_field(tiles, [part.saturated for part in done]),
-        strongest=_field(tiles, [part.strongest for part in done]),
-        ends_e=_field(tiles, [part.ends_e for part in done]) if has_ends else done[0].ends_e,
-        sampled=sum(part.sampled for part in done),
-        stopped=any(part.stopped for part in done),
-        trajectory=middle.trajectory,
-        cause=next((part.cause for part in done if part.cause), ""),
-        empty=EmptySpread.beside([part.empty for part in done]),
-        searched=_searched(done),
-        untold=np.concatenate([part.untold for part in done]),
-    )
-
-
-def _own_rows(tiles: Sequence[Tile], done: Sequence[FinishedChunk]) -> list[int]:
-    """Choose one row for each event, of all rows one after the other, in order of frame."""
-    tables = [part.lines for part in done if len(part.lines)]
-    if not tables:
-        return []
-    table = pd.concat(tables, ignore_index=True)
-    own = np.concatenate([
-        tile.holds(part.lines["y_px"].to_numpy(float), part.lines["x_px"].to_numpy(float))
-        for tile, part in zip(tiles, done, strict=True) if len(part.lines)
-    ])  # fmt: skip
-    same = SameSteps(table)
-    chosen = np.flatnonzero(same.with_strangers(own, ~own))
-    # two of one particle, each in its own core: the clearer one is kept
-    clear = chosen[np.argsort(-table["snr"].to_numpy(float)[chosen], kind="stable")]
-    home = np.repeat(np.arange(len(tables)), [len(each) for each in tables])
-    taken = np.zeros(len(table), dtype=np.bool_)
-    for one in clear.tolist():
-        others = same.like(one)
-        taken[one] = not (taken[others] & (home[others] != home[one])).any()
-    frame, y, x = (table[name].to_numpy(float) for name in ("frame", "y_nm", "x_nm"))
-    return sorted(np.flatnonzero(taken).tolist(), key=lambda i: (frame[i], y[i], x[i]))
-
-
-def _field(tiles: Sequence[Tile], parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Put the cores of tiles in their places.
-
-    Shapes: `parts` (…, y, x), result (…, y, x).
-    """
-    whole = np.zeros((*parts[0].shape[:-2], *tiles[0].field), dtype=parts[0].dtype)
-    for tile, part in zip(tiles, parts, strict=True):
-        whole[(..., *tile.core)] = part
-    return whole
-
-
-def _searched(done: Sequence[FinishedChunk]) -> Searched | None:
-    """Average the shares of tiles, by their pixels."""
-    known = [part for part in done if part.searched is not None]
-    if not known:
-        return None
-    pixels = np.array([np.count_nonzero(~part.masked) for part in known], dtype=np.float64)
-    shares = np.stack([part.searched.shares for part in known if part.searched is not None])
-    frames = known[0].searched.frames if known[0].searched is not None else np.empty(0, np.int64)
-    return Searched(frames, np.average(shares, axis=0, weights=np.maximum(pixels, 1.0)))

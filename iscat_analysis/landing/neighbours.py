@@ -122,11 +122,9 @@ class Neighbours:
         window: int,
         pattern: MovingPattern | None = None,
     ) -> None:
-        self._pattern = pattern
-        self._context = context
-        self._chunk = chunk
-        self._window = window
-        self._roi_px = context.roi_px
+        self.context, self.chunk, self.window, self.pattern = context, chunk, window, pattern
+        self.roi_px = context.roi_px
+        self.stride = int(chunk.edges[1] - chunk.edges[0])
         self._farthest_px = farthest_px(context.config, chunk.shape)
         self.are_spheres = context.model.is_sized
         nominal = context.model.material.mass_kda
@@ -141,7 +139,7 @@ class Neighbours:
         self, sign: int, at: StepFrame, sphere: SeatedModel, fit: FitResult, excess: float = 0.0
     ) -> Step:
         """Make a step of a sphere, whose contrast is drawn where it is."""
-        pixel = self._context.pixel_nm
+        pixel = self.context.pixel_nm
         start = Candidate(fit.x_nm / pixel, fit.y_nm / pixel, fit.z_nm, fit.mass_kda, fit.snr)
         drawn = self.draw(
             sign, at, start, theta=fit.theta, snr=fit.snr, excess=excess, sphere=sphere
@@ -163,12 +161,12 @@ class Neighbours:
 
         Shapes: `theta` (5,).
         """
-        context, half = self._context, self._half(start)
+        context, half = self.context, self._half(start)
         sides = []
-        for centre, size in zip((start.y_px, start.x_px), self._chunk.shape, strict=True):
+        for centre, size in zip((start.y_px, start.x_px), self.chunk.shape, strict=True):
             middle = round(centre)
             sides.append((max(middle - half, 0), min(middle + half + 1, size)))
-        shown = at.frame + sign * self._window // 2
+        shown = at.frame + sign * self.window // 2
 
         def image() -> FloatArray:
             pixel = context.pixel_nm
@@ -189,15 +187,15 @@ class Neighbours:
         """
         strength = max(start.snr / _FAINT_SNR, 1.0)
         regions = min(strength, max(LARGEST_IMAGE, math.sqrt(strength * LARGEST_IMAGE)))
-        return round(min(self._roi_px * regions, self._farthest_px))
+        return round(min(self.roi_px * regions, self._farthest_px))
 
     def reach_px(self, step: Step) -> float:
         """Farthest centre of a fitted square that holds pixels of a step's image."""
-        return self._half(step.start) + self._roi_px / 2 + 2
+        return self._half(step.start) + self.roi_px / 2 + 2
 
     def overlaps(self, step: Step, start: int, stop: int) -> bool:
         """Whether a step lies inside frames relative to the chunk."""
-        first = self._chunk.first
+        first = self.chunk.first
         return start < step.at.last_turn - first and step.at.first_turn - first < stop
 
     def presence(self, step: Step, frames: slice) -> float:
@@ -207,26 +205,26 @@ class Neighbours:
         if whole <= 0:
             return 0.0
         if step.at.rise:
-            turns = np.clip(step.at.turns - self._chunk.first, frames.start, frames.stop)
+            turns = np.clip(step.at.turns - self.chunk.first, frames.start, frames.stop)
             turned = power[turns].mean()
         else:
-            turn = min(max(step.at.frame - self._chunk.first, frames.start), frames.stop)
+            turn = min(max(step.at.frame - self.chunk.first, frames.start), frames.stop)
             turned = power[turn]
         later = (power[frames.stop] - turned) / whole
         return float(later if step.sign > 0 else 1 - later)
 
     def _presences(self, step: Step) -> FloatArray:
         """Give `presence` in every block of the chunk, (blocks,)."""
-        edges = self._chunk.edges
+        edges = self.chunk.edges
         turns = step.at.turns if step.at.rise else np.array([step.at.frame])
-        turned = np.clip((turns - self._chunk.first)[:, None], edges[:-1], edges[1:])
+        turned = np.clip((turns - self.chunk.first)[:, None], edges[:-1], edges[1:])
         ends, whole = self._power[edges[1:]], np.diff(self._power[edges])
         later = (ends - self._power[turned].mean(axis=0)) / np.where(whole > 0, whole, 1.0)
         return np.asarray(later if step.sign > 0 else 1 - later)
 
     def light_in(self, frames: slice, steps: Iterable[Step]) -> FloatArray:
         """Give the factor by which steps change the light of frames, (y, x)."""
-        light = np.ones(self._chunk.shape)
+        light = np.ones(self.chunk.shape)
         for step in steps:
             light[self.box(step)] *= 1 + self.presence(step, frames) * step.image
         return light
@@ -241,12 +239,12 @@ class Neighbours:
         """Light after over light before that a step's particle makes, pixel by pixel."""
         image = step.image[inside].astype(np.float64)
         shares = self.presence(step, before), self.presence(step, after)
-        if self._pattern is None:
+        if self.pattern is None:
             factor: FloatArray = (1 + shares[1] * image) / (1 + shares[0] * image)
             return factor
         windows = before, after
         blocks = self._presences(step)
-        held = [float(self._pattern.weights(before, after, window) @ blocks) for window in windows]
+        held = [float(self.pattern.weights(before, after, window) @ blocks) for window in windows]
         if shares == tuple(held):
             return np.ones(image.shape)
         there = [
@@ -264,13 +262,13 @@ class Neighbours:
         self, ratio: FloatArray, step: Step, before: slice, after: slice, region: Region
     ) -> None:
         """Multiply the pixels of a region that a step's image covers with `factor`."""
-        if self._pattern is None and not self.overlaps(step, before.start, after.stop):
+        if self.pattern is None and not self.overlaps(step, before.start, after.stop):
             return  # there in all of these frames, or in none
         shared = self.shared(step, region)
         if shared is None:
             return
         here, inside = shared
-        if self._pattern is not None:
+        if self.pattern is not None:
             ratio[here] *= self.factor(step, before, after, inside)
             return
         shares = self.presence(step, before), self.presence(step, after)
@@ -290,7 +288,7 @@ class Neighbours:
 
         The contrasts of all of them, that of the step included, are in the ratio and the model.
         """
-        if not self.are_spheres or self._pattern is not None:
+        if not self.are_spheres or self.pattern is not None:
             return
         shown = [step, *(s for s in others if self._is_seen_beside(s, step, region))]
         fields = [self._field(s, region) for s in shown]
@@ -323,11 +321,11 @@ class Neighbours:
 
     def _field(self, step: Step, region: Region) -> ComplexArray:
         """Field of a step's particle over the reference, (1 or 2, y, x)."""
-        pixel, start = self._context.pixel_nm, step.start
+        pixel, start = self.context.pixel_nm, step.start
         place = start.x_px * pixel, start.y_px * pixel
         grid = PixelGrid.region(region.rows, region.columns, pixel)
         dx, dy = np.meshgrid(grid.x_nm - place[0], grid.y_nm - place[1])
-        model = self._context.wide_at(*place, step.at.frame + step.sign * self._window // 2)
+        model = self.context.wide_at(*place, step.at.frame + step.sign * self.window // 2)
         return model.field(dx, dy, start.z_nm, start.mass_kda)
 
     def _together(self, one: Step, other: Step, frames: slice) -> float:
@@ -350,7 +348,7 @@ class Neighbours:
         A weak one has the same image, its own, at all times.
         """
         strong = abs(step.start.mass_kda * self._contrast_per_kda) > _WEAK_CONTRAST
-        if strong or step.is_measured or self._pattern is not None:
+        if strong or step.is_measured or self.pattern is not None:
             return self.factor(step, before, after) - 1, 1.0
         return step.image, self.presence(step, after) - self.presence(step, before)
 
@@ -361,7 +359,7 @@ class Neighbours:
 
     def _present(self, step: Step, frames: slice) -> slice:
         """Select the frames in which the particle is there; all frames if it is in none."""
-        turn = min(max(step.at.frame - self._chunk.first, frames.start), frames.stop)
+        turn = min(max(step.at.frame - self.chunk.first, frames.start), frames.stop)
         part = slice(turn, frames.stop) if step.sign > 0 else slice(frames.start, turn)
         return part if part.start < part.stop else frames
 
@@ -370,9 +368,9 @@ class Neighbours:
     ) -> FloatArray:
         """Mean of a moving particle's contrast over frames, or its contrast at the mean place."""
         image = step.image[inside].astype(np.float64)
-        if self._pattern is None:
+        if self.pattern is None:
             return image
-        (y, x), (yy, yx, xx) = self._pattern.moments(frames, step.at.frame)
+        (y, x), (yy, yx, xx) = self.pattern.moments(frames, step.at.frame)
         if not smeared:
             yy, yx, xx = y * y, y * x, x * x
         seen: FloatArray = image + np.einsum(
@@ -394,28 +392,28 @@ class Neighbours:
             )
         )
         reach = np.array([self.reach_px(s) for s in steps])
-        windows = SPAN if self._pattern is None else self._pattern.windows
+        windows = SPAN if self.pattern is None else self.pattern.windows
         seen, bound = [], []
         for i in range(len(steps)):
             dt = np.abs(frame - frame[i])
             dx, dy = np.abs(x - x[i]), np.abs(y - y[i])
-            close = dt < max((1 + windows) * self._window, frames)
+            close = dt < max((1 + windows) * self.window, frames)
             close |= self.are_spheres  # what stands there all the time has a field too
             near = close & (np.maximum(dx, dy) < reach)
             near[i] = False
             seen.append(array("i", np.flatnonzero(near).tolist()))
-            near &= (dt < 2 * self._window) & (np.hypot(dx, dy) < self._roi_px / 2)
+            near &= (dt < 2 * self.window) & (np.hypot(dx, dy) < self.roi_px / 2)
             bound.append(array("i", np.flatnonzero(near).tolist()))
         return seen, bound
 
     def shown(self, step: Step, region: Region) -> tuple[tuple[slice, slice], FloatArray] | None:
         """Which pixels of a region show a step, and its contrast there, as frames are corrected."""
         shared = self.shared(step, region)
-        if self._context.lines is None:
+        if self.context.lines is None:
             return None if shared is None else (shared[0], step.image[shared[1]].astype(np.float64))
-        total = np.zeros(self._chunk.shape)
+        total = np.zeros(self.chunk.shape)
         total[self.box(step)] = step.image
-        return WHOLE, self._context.left(total)[region.slices]
+        return WHOLE, self.context.left(total)[region.slices]
 
     def shared(
         self, step: Step, region: Region

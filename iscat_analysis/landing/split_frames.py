@@ -15,7 +15,7 @@ from iscat_analysis.camera import Camera
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event, Region, photons_scale
 from iscat_analysis.fitting.field import total_signal
-from iscat_analysis.fitting.pattern import LocalPattern, MovingPattern
+from iscat_analysis.fitting.pattern import LocalPattern
 from iscat_analysis.inference.split_frames import (
     PARTS,
     Response,
@@ -54,24 +54,22 @@ def nothing_repeated(mode: str) -> FloatArray:
 
 
 def step_repeats(
-    chunk: Chunk,
     spans: tuple[tuple[int, int], tuple[int, int]],
     event: Event,
     step: Step,
     others: Sequence[Step],
     neighbours: Neighbours,
-    pattern: MovingPattern | None,
-    mode: str,
 ) -> FloatArray:
     """Compare the estimates from parts of the frames of one landing or leaving.
 
     `spans` are frames without and with its particle; they contain its windows and may be longer.
     """
-    region, windows = event.region, event.windows
+    region, windows, chunk = event.region, event.windows, neighbours.chunk
     response = _response(event)
     if response is None:
-        return nothing_repeated(mode)
-    local = pattern.local(region, step.at.frame) if pattern else None
+        return nothing_repeated(neighbours.context.mode)
+    moving = neighbours.pattern
+    local = None if moving is None else moving.local(region, step.at.frame)
     whole = chunk.patch(min(spans)[0], max(spans)[1], region.rows, region.columns)
     light = whole.mean_e
     read = np.square(whole.read_noise_e) * np.ones(region.shape)
@@ -99,8 +97,8 @@ def step_repeats(
             height = np.einsum("iyx,yx->i", weights[(slice(None), *here)], light[here] * image)
             there = (frames >= other.at.turns[:, None]).mean(axis=0)
             known += np.outer(other.sign * height, there)
-        if pattern and local:
-            known += _moved(chunk, step, region, weights, light, frames, pattern, local, neighbours)
+        if local is not None:
+            known += _moved(step, region, weights, light, frames, local, neighbours)
         left = replace(one, values=one.values - known * one.power)
         inside = (frames >= window[0]) & (frames < window[1])
         own.append(replace(left, values=left.values[:, inside], power=left.power[inside]))
@@ -109,24 +107,21 @@ def step_repeats(
 
 
 def _moved(
-    chunk: Chunk,
     step: Step,
     region: Region,
     weights: FloatArray,
     light: FloatArray,
     frames: NDArray[np.int64],
-    pattern: MovingPattern,
     local: LocalPattern,
     neighbours: Neighbours,
 ) -> FloatArray:
     """Give what the motion of the pattern, and of the particle, adds to each frame."""
-    shared = neighbours.shared(step, region)
-    stride = int(chunk.edges[1] - chunk.edges[0])
+    stride, shared = neighbours.stride, neighbours.shared(step, region)
     centres, heights = [], []
     for start in range(0, frames.size, stride):
         part = frames[start : start + stride]
-        cut = chunk.cut(int(part[0]), int(part[-1]) + 1)
-        seen = pattern.seen(local, cut)
+        cut = neighbours.chunk.cut(int(part[0]), int(part[-1]) + 1)
+        seen = local.seen(cut)
         if shared is not None:
             here, inside = shared
             there = (part[len(part) // 2] >= step.at.frame) == (step.sign > 0)
@@ -137,18 +132,13 @@ def _moved(
 
 
 def step_controls(
-    context: AnalysisContext,
-    chunk: Chunk,
-    window: int,
-    events: Sequence[Event],
-    steps: Sequence[Step],
-    neighbours: Neighbours,
-    own: Box = EVERYWHERE,
+    events: Sequence[Event], steps: Sequence[Step], neighbours: Neighbours, own: Box = EVERYWHERE
 ) -> EmptySpread | None:
     """Make the same estimates in windows in which nothing lands or leaves, at its own pixels.
 
     The middle of a tile is enough: its field has many.
     """
+    context, chunk, window = neighbours.context, neighbours.chunk, neighbours.window
     times = sorted({event.frame for event in events})
     times = [t for t in times if chunk.first <= t - window and t + window <= chunk.stop]
     if not times:

@@ -18,9 +18,8 @@ from itertools import compress
 import numpy as np
 
 from iscat_analysis._kernels.sliding import strongest_maps
-from iscat_analysis.fitting.context import AnalysisContext, reported_steps
+from iscat_analysis.fitting.context import reported_steps
 from iscat_analysis.fitting.events import Event, fit_flags, standing_out, with_index, with_spheres
-from iscat_analysis.fitting.pattern import MovingPattern
 from iscat_analysis.inference.fit import (
     POOR_FIT_P,
     detection_snr,
@@ -45,7 +44,7 @@ from iscat_analysis.landing.tasks import (
 from iscat_analysis.records import FREE_PARAMETERS, Candidate, Clip, FloatArray, Trace
 from iscat_analysis.search.dating import StepFrame, common_rise, go_on_rising
 from iscat_analysis.search.empty import EmptySpread
-from iscat_analysis.search.frames import EVERYWHERE, Box, Chunk, is_within
+from iscat_analysis.search.frames import EVERYWHERE, Box, is_within
 from iscat_analysis.search.peaks import Described, chi2_excess
 from iscat_analysis.search.sliding import MapArray, Peak, find_steps, make_filter
 from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, refuse_flood
@@ -75,29 +74,20 @@ class ChunkFitter:
 
     def __init__(
         self,
-        context: AnalysisContext,
-        chunk: Chunk,
-        window: int,
+        neighbours: Neighbours,
         pool: ThreadPoolExecutor,
-        pattern: MovingPattern | None = None,
-        *,
         excess_noise: ExcessNoise | None = None,
         own: Box = EVERYWHERE,
+        *,
         controlled: bool = True,
     ) -> None:
-        self._controlled = controlled
-        self._excess_noise = excess_noise
-        self._own = own  # pixels of the chunk that count: those of the core of a tile
-        self._context = context
-        self._chunk = chunk
-        self._pattern = pattern
-        self._window = window
-        self._pool = pool
-        self._roi_px = context.roi_px
-        self.neighbours = Neighbours(context, chunk, window, pattern)
-        self._tasks = TaskBuilder(context, chunk, window, self.neighbours, pattern)
-        self._stride = int(chunk.edges[1] - chunk.edges[0])
-        self._sieve = SidelobeFilter(chunk.first, self._stride, window, context.roi_px)
+        self.neighbours, self._tasks = neighbours, TaskBuilder(neighbours)
+        self._pool, self._excess_noise, self._controlled = pool, excess_noise, controlled
+        self.mapper = pool.map
+        self.own = own  # pixels of the chunk that count: those of the core of a tile
+        self._context, chunk = neighbours.context, neighbours.chunk
+        self._chunk, self._window, self._stride = chunk, neighbours.window, neighbours.stride
+        self._sieve = SidelobeFilter(chunk.first, self._stride, self._window, neighbours.roi_px)
         self._doubtful: list[Peak] = []
         self._last: tuple[list[Peak], tuple[MapArray, FloatArray]] | None = None
         self.strongest = np.zeros((2, *chunk.shape), dtype=np.float32)  # of a figure
@@ -110,12 +100,10 @@ class ChunkFitter:
         """Find and fit every step."""
         templates = self._context.templates
         matched = make_filter(self._chunk, templates.images[0], templates.noise)
-        maps = StepMaps(self._context, self._chunk, matched, self.neighbours, self._pattern)
+        maps = StepMaps(self.neighbours, matched)
         steps: list[Step] = []
-        if self._pattern is None:
-            steps = large_steps(
-                self._context, self._chunk, self._window, self.neighbours, self._pool.map
-            )
+        if self.neighbours.pattern is None:
+            steps = large_steps(self.neighbours, self.mapper)
         rejected: list[Step] = []
         for self.rounds in range(1, ROUNDS + 1):
             fresh = [
@@ -153,16 +141,11 @@ class ChunkFitter:
             credible = self._credible(steps)
             kept = {id(s) for s in credible}
             rejected += [s for s in steps if id(s) not in kept]
-            steps = with_measured_images(
-                credible, self.neighbours.of(credible)[0], self._chunk, self.neighbours,
-                self._window, self._context.templates.threshold, self._roi_px,
-            ) if credible else []  # fmt: skip
+            if steps := credible:
+                near = self.neighbours.of(steps)[0]
+                steps = with_measured_images(steps, near, self.neighbours)
         if core is not None and self._last is not None:
-            self.searched = searched_shares(
-                self._chunk, core, steps, *self._last,
-                window=self._window, roi_px=self._roi_px,
-                threshold=self._context.templates.threshold, own=self._own,
-            )  # fmt: skip
+            self.searched = searched_shares(self.neighbours, core, steps, *self._last, self.own)
         self._last = None
         del maps  # fits need their memory
         if not steps:
@@ -182,42 +165,35 @@ class ChunkFitter:
         ]
         own = [i for i in now if self._is_near_core(everything[i], _CORE_MARGIN_PX)]
         order = _by_place(everything, own)
-        finished = self._pool.map(
+        finished = self.mapper(
             lambda i: self._finish(i, everything, seen, around, lobe=i >= len(steps)), order
         )
         found = dict(zip(order, finished, strict=True))
         beside = [steps[i] for i in sorted({*now}.difference(own)) if i < len(steps)]
         fitted = self._judged([one for i in own if (one := found[i]) is not None], beside)
-        if fitted and not self._pattern and self._controlled:
+        if fitted and not self.neighbours.pattern and self._controlled:
             events = standing_out([f.event for f in fitted])
-            self.empty = step_controls(
-                context=self._context, chunk=self._chunk, window=self._window,
-                events=events, steps=everything, neighbours=self.neighbours, own=self._own,
-            )  # fmt: skip
+            self.empty = step_controls(events, everything, self.neighbours, self.own)
         return sorted(fitted, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
 
     def shown(
         self, fitted: Sequence[StepEvent], clips: int
     ) -> list[tuple[Trace | None, Clip | None]]:
         """Give what the report shows of steps beside their images."""
-        chunk, window = self._chunk, self._window
 
         def one(number: int) -> tuple[Trace | None, Clip | None]:
             step = fitted[number]
-            patch = patch_of(step, chunk, window)
-            trace = trace_of(step, patch, chunk, self.neighbours, self._tasks)
-            clip = None
-            if number < clips:
-                clip = clip_of(step, patch, self._context, chunk, window, self._pattern)
-            return trace, clip
+            patch = patch_of(step, self.neighbours)
+            trace = trace_of(step, patch, self._tasks)
+            return trace, clip_of(step, patch, self.neighbours) if number < clips else None
 
-        return list(self._pool.map(one, range(len(fitted))))
+        return list(self.mapper(one, range(len(fitted))))
 
     # ---- search ----------------------------------------------------------------------------
 
     def _search(self, maps: StepMaps, steps: Sequence[Step]) -> list[Step]:
         context, chunk, matched = self._context, self._chunk, maps.matched
-        snr, effective = maps.without(steps, self._pool.map)
+        snr, effective = maps.without(steps, self.mapper)
         if not steps and len(snr):
             where = np.empty(chunk.shape, dtype=np.int64)
             strongest_maps(snr, where)
@@ -255,7 +231,7 @@ class ChunkFitter:
 
     def _is_near_core(self, step: Step, margin_px: float) -> bool:
         """Whether a step is in the core of a tile, or nearer to it than a margin."""
-        return is_within(self._own, step.start.y_px, step.start.x_px, margin_px)
+        return is_within(self.own, step.start.y_px, step.start.x_px, margin_px)
 
     def _improve(
         self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]
@@ -311,7 +287,7 @@ class ChunkFitter:
 
         refitted, order = list(steps), _by_place(steps, chosen)[:: self._direction]
         self._direction = -self._direction
-        for index, step in zip(order, self._pool.map(one, order), strict=True):
+        for index, step in zip(order, self.mapper(one, order), strict=True):
             refitted[index] = step
         return refitted
 
@@ -384,9 +360,7 @@ class ChunkFitter:
         others = tuple(steps[i] for i in seen)
         far = others if context.lines is not None else [steps[i] for i in around[index]]
         spans, lighting = self._tasks.trace_spans(step, task.windows, far)
-        repeats = step_repeats(
-            self._chunk, spans, event, step, lighting, self.neighbours, self._pattern, context.mode
-        )
+        repeats = step_repeats(spans, event, step, lighting, self.neighbours)
         return _Finished(StepEvent(event, step, others, repeats, told), task.crowded, lobe)
 
     def _judged(self, finished: Sequence[_Finished], beside: Sequence[Step]) -> list[StepEvent]:
@@ -416,7 +390,9 @@ class ChunkFitter:
         for number, own in enumerate(finished):
             away = np.hypot(x_px - x_px[number], y_px - y_px[number])
             at_once = np.abs(frame - frame[number]) < self._window
-            near = np.flatnonzero(at_once & (away < LARGEST_IMAGE * self._roi_px)).tolist()
+            near = np.flatnonzero(
+                at_once & (away < LARGEST_IMAGE * self.neighbours.roi_px)
+            ).tolist()
             event = own.fitted.event
             flags = fit_flags(
                 self._context,
@@ -427,7 +403,8 @@ class ChunkFitter:
                 changing=steps[number].at.p_constant < POOR_FIT_P
                 or (settling[steps[number].sign] and steps[number].at.rise > 0)
                 or any(
-                    away[i] < self._roi_px / 2 and _outshines(steps[i], steps[number]) for i in near
+                    away[i] < self.neighbours.roi_px / 2 and _outshines(steps[i], steps[number])
+                    for i in near
                 ),
             )
             judged.append(replace(own.fitted, event=replace(event, flags=flags)))

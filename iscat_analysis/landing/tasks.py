@@ -14,16 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event, Region, Told, region_around
-from iscat_analysis.fitting.pattern import LocalPattern, MovingPattern
+from iscat_analysis.fitting.pattern import LocalPattern
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import BoolArray, Clip, FloatArray, Trace, Windows
 from iscat_analysis.search.dating import StepFrame, crosstalk, frame_heights, locate_step
-from iscat_analysis.search.frames import Chunk, Patch
+from iscat_analysis.search.frames import Patch
 from iscat_analysis.trust.changing_light import SAME_NM
 
 FEWEST_FRAMES = 10
@@ -66,21 +65,11 @@ class StepEvent:
 class TaskBuilder:
     """Builds the likelihoods of the steps of one chunk."""
 
-    def __init__(
-        self,
-        context: AnalysisContext,
-        chunk: Chunk,
-        window: int,
-        neighbours: Neighbours,
-        pattern: MovingPattern | None = None,
-    ) -> None:
-        self._pattern = pattern
-        self._context = context
-        self._chunk = chunk
-        self._window = window
-        self._neighbours = neighbours
-        self._roi_px = context.roi_px
-        self._stride = int(chunk.edges[1] - chunk.edges[0])
+    def __init__(self, neighbours: Neighbours) -> None:
+        self.neighbours = neighbours
+        self._context, self._chunk = neighbours.context, neighbours.chunk
+        self._window, self._pattern = neighbours.window, neighbours.pattern
+        self._roi_px, self._stride = neighbours.roi_px, neighbours.stride
         self._search_reach = self._stride + self._stride // 2 + 1  # of a date, in frames
         self.rise = {1: 0, -1: 0}  # frames over which most landings, and leavings, take place
 
@@ -123,20 +112,20 @@ class TaskBuilder:
         ratio = np.full(before.shape, power_after / power_before)
         cuts = chunk.cut(*first), chunk.cut(*second)
         for other in neighbours:
-            self._neighbours.apply(ratio, other, *cuts, region)
-        self._neighbours.interfere(ratio, step, neighbours, *cuts, region)
+            self.neighbours.apply(ratio, other, *cuts, region)
+        self.neighbours.interfere(ratio, step, neighbours, *cuts, region)
         if context.lines is not None:
             there = [self._present(steps, span, cut) for cut in cuts]
             taken = [context.lines.taken(signal)[region.slices] for signal in there]
             ratio *= taken[0] / taken[1]
         offset = np.zeros(2)
         if moving and local:
-            seen = [moving.seen(local, cut) for cut in cuts]
+            seen = [local.seen(cut) for cut in cuts]
             ratio *= seen[1] / seen[0]
-            shared = self._neighbours.shared(step, region)
+            shared = self.neighbours.shared(step, region)
             if shared is not None:
                 here, inside = shared
-                ratio[here] *= self._neighbours.own_factor(step, *cuts, inside)
+                ratio[here] *= self.neighbours.own_factor(step, *cuts, inside)
             with_it = cuts[1] if step.sign > 0 else cuts[0]
             offset = moving.shift(with_it) - moving.at(at.frame)
         read = np.square(patch.read_noise_e, dtype=np.float64)  # one number for most cameras
@@ -214,9 +203,7 @@ class TaskBuilder:
         total = np.zeros(self._chunk.shape)
         for step in steps:
             if span[0] < step.at.frame < span[1]:
-                total[self._neighbours.box(step)] += (
-                    self._neighbours.presence(step, cut) * step.image
-                )
+                total[self.neighbours.box(step)] += self.neighbours.presence(step, cut) * step.image
         return total
 
     def _span(self, step: Step, close: Sequence[Step]) -> tuple[tuple[int, int], bool]:
@@ -242,7 +229,7 @@ class TaskBuilder:
         patch: Patch,
         pattern: LocalPattern | None,
     ) -> StepFrame | None:
-        shared = self._neighbours.shared(step, region)
+        shared = self.neighbours.shared(step, region)
         if shared is None:
             return None
         image = step.image[shared[1]].astype(np.float64)
@@ -284,29 +271,29 @@ class TaskBuilder:
         frames = np.arange(patch.first, patch.first + known.size)
         seen, images = [], []
         for other in neighbours:
-            near = self._neighbours.are_spheres or distance_px(other, step) < self._roi_px
-            both = self._neighbours.shared(other, region) if near else None
+            near = self.neighbours.are_spheres or distance_px(other, step) < self._roi_px
+            both = self.neighbours.shared(other, region) if near else None
             if both is None or not frames[0] < other.at.frame <= frames[-1]:
                 continue
             here, inside = both
             padded = np.zeros(image.shape)
             padded[here] = other.image[inside]
             if step.sign * (other.at.frame - step.at.frame) > 0:  # the step's particle is there
-                padded += self._neighbours.crossed(step, other, region)
+                padded += self.neighbours.crossed(step, other, region)
             seen.append(other)
             images.append(padded)
-        if self._neighbours.are_spheres:  # frames are set against their mean light, theirs included
+        if self.neighbours.are_spheres:  # frames are set against their mean light, theirs included
             cut = self._chunk.cut(int(frames[0]), int(frames[-1]) + 1)
-            light = 1 + self._neighbours.presence(step, cut) * image
+            light = 1 + self.neighbours.presence(step, cut) * image
             light += sum(
-                self._neighbours.presence(s, cut) * own for s, own in zip(seen, images, strict=True)
+                self.neighbours.presence(s, cut) * own for s, own in zip(seen, images, strict=True)
             )
             images = [one / light for one in images]
         for other, height in zip(seen, crosstalk(patch, image, images), strict=True):
             known += other.sign * height * (frames >= other.at.turns[:, None]).mean(axis=0)
-        own = self._neighbours.shared(step, region)
-        if self._pattern and pattern and own is not None:
-            known += self._drifting(step, image, own[1], patch, self._pattern, pattern)
+        own = self.neighbours.shared(step, region)
+        if pattern and own is not None:
+            known += self._drifting(step, image, own[1], patch, pattern)
         return known
 
     def _drifting(
@@ -315,7 +302,6 @@ class TaskBuilder:
         image: FloatArray,
         inside: tuple[slice, slice],
         patch: Patch,
-        moving: MovingPattern,
         pattern: LocalPattern,
     ) -> FloatArray:
         """Height that the motion of the pattern, and of the particle itself, adds to each frame."""
@@ -326,8 +312,8 @@ class TaskBuilder:
             part = frames[start : start + self._stride]
             cut = self._chunk.cut(int(part[0]), int(part[-1]) + 1)
             centres.append(float(part.mean()))
-            patterns.append(moving.seen(pattern, cut) / light - 1)
-            moved.append(self._neighbours.seen(step, cut, inside) - image)
+            patterns.append(pattern.seen(cut) / light - 1)
+            moved.append(self.neighbours.seen(step, cut, inside) - image)
         there = (frames >= step.at.frame) == (step.sign > 0)
         height: FloatArray = np.interp(frames, centres, crosstalk(patch, image, patterns))
         height += there * np.interp(frames, centres, crosstalk(patch, image, moved))
@@ -347,18 +333,16 @@ CLIP_STEPS = 6
 """Images of a clip from the first that reaches the step to the one at the step."""
 
 
-def patch_of(fitted: StepEvent, chunk: Chunk, window: int) -> Patch:
+def patch_of(fitted: StepEvent, neighbours: Neighbours) -> Patch:
     """Copy the frames around a step, for `trace_of` and `clip_of`."""
     region = fitted.event.region
-    turn, reach = fitted.step.at.frame, TRACE_WINDOWS * window
-    return chunk.patch(turn - reach, turn + reach, region.rows, region.columns)
+    turn, reach = fitted.step.at.frame, TRACE_WINDOWS * neighbours.window
+    return neighbours.chunk.patch(turn - reach, turn + reach, region.rows, region.columns)
 
 
-def trace_of(
-    fitted: StepEvent, patch: Patch, chunk: Chunk, neighbours: Neighbours, tasks: TaskBuilder
-) -> Trace | None:
+def trace_of(fitted: StepEvent, patch: Patch, tasks: TaskBuilder) -> Trace | None:
     """Measure the contrast of a step's particle in every frame around the step."""
-    event = fitted.event
+    event, neighbours, chunk = fitted.event, tasks.neighbours, tasks.neighbours.chunk
     fit, windows, region = event.fit, event.windows, event.region
     step, turn = fitted.step, fitted.step.at.frame
     shown = neighbours.shown(step, region)  # as of the last sweep, close to the final fit
@@ -390,16 +374,10 @@ def trace_of(
     )
 
 
-def clip_of(
-    fitted: StepEvent,
-    patch: Patch,
-    context: AnalysisContext,
-    chunk: Chunk,
-    window: int,
-    pattern: MovingPattern | None = None,
-) -> Clip | None:
+def clip_of(fitted: StepEvent, patch: Patch, neighbours: Neighbours) -> Clip | None:
     """Set windows that slide over a step against those before them."""
-    turn, start = fitted.step.at.frame, fitted.event.candidate
+    context, chunk, pattern = neighbours.context, neighbours.chunk, neighbours.pattern
+    window, turn, start = neighbours.window, fitted.step.at.frame, fitted.event.candidate
     side = min(context.roi_px, 2 * math.ceil(CLIP_NM / context.pixel_nm / 2) - 1)
     fold = math.ceil(side / CLIP_PIXELS)
     square, whole = region_around(side, chunk.shape, start), fitted.event.region
@@ -426,11 +404,11 @@ def clip_of(
         return None
     ratio = power_after[held] / power_before[held]
     expected_e = before_e[held] * ratio[:, None, None]
-    if pattern and local:
+    if local is not None:
         for expected, k in zip(expected_e, held, strict=True):
             first, middle, last = (ends[k + side * CLIP_STEPS] for side in (0, 1, 2))
             spans = (first, middle), (middle, last)
-            seen = [pattern.seen(local, chunk.cut(*span)) for span in spans]
+            seen = [local.seen(chunk.cut(*span)) for span in spans]
             expected *= seen[1] / seen[0]
     images = _ratio(after_e[held], expected_e, patch.usable, fold)
     frames = tuple(ends[CLIP_STEPS + k] for k in held)

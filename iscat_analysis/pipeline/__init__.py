@@ -1,8 +1,8 @@
 """The main job: load → calibrate → background → detect → fit → posterior → bounds → report.
 
-`analyse` does it in this order.  `prepare` loads and calibrates.  What `finder` gives, chosen
-by ``background.method`` alone (`background_mode`), measures the background, searches, fits, samples
-posteriors and computes bounds.  `make_analysis` makes the table, and describes tracks and species.
+`analyse` does it in this order.  `prepare` loads and calibrates.  The kind of the movie, chosen by
+``background.method`` (`kind_of`), measures the background, searches, fits, samples posteriors and
+computes bounds.  `make_analysis` makes the table, and describes tracks and species.
 
 An event is first a candidate, then `Fitted` while its neighbours are still being found, then an
 `Event` with its verdict.  Its row is made when all events are known, because its number and some
@@ -11,16 +11,27 @@ of its errors depend on all of them (`rows`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+from iscat_analysis.calibration import with_standards
+from iscat_analysis.camera import text_summary
 from iscat_analysis.config import Config, refuse_rod
-from iscat_analysis.diagnosis import Prepared
+from iscat_analysis.diagnosis import (
+    LIGHT_STEPS,
+    Prepared,
+    Step,
+    as_landing,
+    as_moving,
+    calibrated,
+    changes_summary,
+    look_at_changes,
+)
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.executors import Executor, LocalExecutor
-from iscat_analysis.fitting.ranges import BackgroundMode, background_mode
-from iscat_analysis.fitting.results import DetectionResult
+from iscat_analysis.findings import Finding, existing, remark
+from iscat_analysis.fitting.ranges import tracked_frames
 from iscat_analysis.fitting.run import (
     Notify,
     Run,
@@ -32,28 +43,15 @@ from iscat_analysis.fitting.run import (
     remove_parts,
 )
 from iscat_analysis.inference.checks import number_in, path_in
+from iscat_analysis.instrument.contrast_sign import learn_sign, wrong_sign
+from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.movie import Stack, open_stack, path_beside
 from iscat_analysis.pipeline.finish import make_analysis
-from iscat_analysis.pipeline.injection import injected
-from iscat_analysis.pipeline.prepare import prepare
+from iscat_analysis.pipeline.kinds import kind_of
 from iscat_analysis.records import Analysis, Progress, silent
-from iscat_analysis.report import EVENT_FIGURES, write_report
+from iscat_analysis.report import write_report
 from iscat_analysis.report.output import check_output, claim_output
-
-FEW_FIGURES = 2
-"""Events of a landing movie that are drawn for print; the page shows hundreds."""
-
-
-def finder(mode: BackgroundMode) -> Callable[[Prepared, Run], DetectionResult]:
-    """Import background, search and fits of one kind of movie; each takes a while to load."""
-    match mode:
-        case "fixed":
-            from iscat_analysis.pipeline.before_after import find_before_after as find
-        case "sliding":
-            from iscat_analysis.landing.find import find_landings as find
-        case "tracks":
-            from iscat_analysis.tracking.find import find_moving as find
-    return find
+from iscat_analysis.threads import start_in_thread
 
 
 def fit_stack(
@@ -113,8 +111,7 @@ def fit_stack(
     inject = int(number_in("`inject`", inject, least=0, whole=True))
     folder = path_beside(stack, ".iscat") if out is None else out
     overwrite = overwrite or is_resumable(folder)
-    mode = background_mode(config)
-    figures = FEW_FIGURES if mode == "sliding" else EVENT_FIGURES
+    kind = kind_of(config)
     check_output(folder, overwrite)
     partial = partial_folder(folder.resolve())
     with claim_output(folder, overwrite):
@@ -130,10 +127,11 @@ def fit_stack(
                 inject=inject,
                 executor=executor,
             )
-        with parts_kept(None if mode == "fixed" else partial):
+        with parts_kept(partial if kind.keeps_parts else None):
             write_report(
-                analysis, folder, overwrite=overwrite, event_figures=figures, executor=executor
-            )
+                analysis, folder, overwrite=overwrite, event_figures=kind.event_figures,
+                executor=executor,
+            )  # fmt: skip
         if not analysis.summary["interrupted"]:
             remove_parts(partial)
     if analysis.summary["interrupted"]:
@@ -165,12 +163,93 @@ def analyse(
     started = datetime.now(UTC).isoformat(timespec="seconds")
     with compiling(notify):
         run = Run(notify, progress, partial, executor or LocalExecutor(), inject)
+        kind = kind_of(config)
         ready = prepare(movie, config, run)  # load, calibrate
-        # background, detect, fit, posterior, bounds
-        found = finder(ready.background_mode)(ready, run)
-        with parts_kept(None if ready.background_mode == "fixed" else partial):
-            extra, stopped = injected(ready, run, found)
+        kind.refuse(run, movie.name)
+        found = kind.find(ready, run)  # background, detect, fit, posterior, bounds
+        with parts_kept(partial if kind.keeps_parts else None):
+            extra, stopped = kind.inject(ready, run, found)
             stopped = stopped or found.interrupted
             return make_analysis(
-                ready, run, found, extra, command=command, started=started, interrupted=stopped
-            )
+                kind, ready, run, found, extra,
+                command=command, started=started, interrupted=stopped,
+            )  # fmt: skip
+
+
+def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
+    """Load and calibrate a movie."""
+    ready = calibrated(movie, config, STEPS, report=run.report, notify=run.notify, ahead=True)
+    run.clock.lap("optics")
+    text = ready.known.text
+    left_out = {"texts": [] if text is None else text_summary(text)}
+    summary = {**ready.summary, "left_out": ready.stretches.summary | left_out}
+    return replace(ready, summary=summary).over_all_stretches()
+
+
+def times(state: Prepared) -> tuple[Prepared, list[Finding]]:
+    """Say what rate, exposure and length leave unknown where particles are followed."""
+    if not state.config.fit.follows_tracks:
+        return state, []
+    from iscat_analysis.tracking.tracks import judge_times
+
+    frames = tracked_frames(state.movie, state.config)
+    return state, [remark(text) for text in judge_times(state.config, frames, state.movie.name)]
+
+
+def optics(state: Prepared) -> tuple[Prepared, list[Finding]]:
+    """Learn the optics, or the sign of the contrast, from the brightest particles."""
+    configured, camera, steady = state.config, state.camera, state.steady
+    texts: list[str] = []
+    wrong = wrong_sign(configured)
+    if wrong is not None:
+        config, learned = learn_sign(
+            steady, wrong, camera, warn=texts.append, notify=state.notify, opening=state.opening
+        )
+        config = _with_standards(config, state)
+    else:
+        config, learned = learn_optics(
+            steady, _with_standards(configured, state), camera,
+            warn=texts.append, notify=state.notify, opening=state.opening,
+        )  # fmt: skip
+    changes, stretches, breaks = state.changes, state.stretches, None
+    if changes is not None and config.optics.na != configured.optics.na:
+        changes = start_in_thread(look_at_changes, steady, config, camera, state.span)
+    if config.background.slides and config.optics.focus_jumps:
+        jumps = [frame for frame, rise in config.optics.focus_jumps if rise]
+        stretches = stretches.with_jumps(jumps)
+        if stretches is not state.stretches:
+            breaks = stretches.finding(steady.name)
+    summary = {**state.summary, **({"optics": learned} if learned else {})}
+    state = replace(state, config=config, changes=changes, stretches=stretches, summary=summary)
+    return state, existing([*(remark(text) for text in texts), breaks])
+
+
+def kind(state: Prepared) -> tuple[Prepared, list[Finding]]:
+    """Tell whether particles move where landings were expected, or land where they should move."""
+    if state.changes is None:
+        return state, []
+    changes = state.changes.result()
+    other = (as_landing if state.config.fit.follows_tracks else as_moving)(
+        changes, state.movie.name
+    )
+    summary = {**state.summary, "changes": changes_summary(changes)}
+    said = "" if other is None else other.text
+    return replace(state, other_kind=said, summary=summary), existing([other])
+
+
+STEPS: tuple[Step, ...] = (*LIGHT_STEPS, times, optics, kind)
+"""From an open movie to one that can be searched."""
+
+
+def _with_standards(config: Config, state: Prepared) -> Config:
+    """Say where the gradient is taken whose standards have no recorded optics."""
+    found = with_standards(config)
+    if found is not config:
+        told = found.optics
+        state.notify(
+            "[calibration] does not say with what optics its standards were measured: the gradient "
+            f"is taken at those of the configuration (focus {told.focus_nm:g} nm, NA "
+            f"{told.na:g}, height {found.particle.nominal_height_nm:g} nm); "
+            "`iscat calibrate mass` writes a line with its optics"
+        )
+    return found

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import zip_longest
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from iscat_analysis.camera import measure_windows, refine_power, start_power
 from iscat_analysis.diagnosis import (
     Noise,
     Prepared,
     drift_warning,
     examine_background,
     judge_background,
-    judge_beside,
     misfit_warning,
     pixel_warnings,
     repeats_warning,
@@ -27,17 +28,22 @@ from iscat_analysis.diagnosis import (
 )
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.camera import MODEL_MISFITS
+from iscat_analysis.findings.particles import MASSES_CHANGE
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import (
     Event,
+    Fitted,
+    PlaceAndMass,
     Region,
     contrast_image,
+    index_finding,
     photons_scale,
     posterior_of,
-    untold_message,
+    region_around,
+    region_likelihood,
     with_index,
 )
-from iscat_analysis.fitting.field import add_signal, fit_field
+from iscat_analysis.fitting.field import add_signal, fit_field, search_field
 from iscat_analysis.fitting.ranges import checked, frame_ranges, measured_windows
 from iscat_analysis.fitting.results import (
     Compared,
@@ -47,15 +53,20 @@ from iscat_analysis.fitting.results import (
     view_of,
 )
 from iscat_analysis.fitting.run import Run
+from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.landing.split_frames import field_repeats
 from iscat_analysis.movie import Stack
+from iscat_analysis.pipeline.kinds import Kind, Look, Redraw, candidate_table, with_threshold
 from iscat_analysis.records import (
     FREE_PARAMETERS,
+    Candidate,
+    EventView,
     FloatArray,
     PosteriorResult,
     Progress,
     Status,
     Windows,
+    is_event,
     verdict,
 )
 from iscat_analysis.threads import threads
@@ -70,26 +81,133 @@ _LEAST_AWAY = 0.25  # of the field, from which what no particle explains is told
 _NEAR = 2.0  # λ/NA from a particle, within which a wrong model leaves most of it over
 
 
-def find_before_after(ready: Prepared, run: Run) -> DetectionResult:
-    """Find particles in the frames after a background; mode track fits each frame by itself."""
-    ready, windows = _sum_frames(ready, run)
-    context, noise, summary, doubt = _background(ready, run, windows)
-    movie, camera = ready.steady, ready.camera
-    with threads(context.config.compute.workers) as pool:
-        if context.mode == "track":
-            from iscat_analysis.tracking.find import track_frames
+@dataclass(frozen=True)
+class Background:
+    """The sums of a movie over its background, and what these say of noise and drift.
 
-            found = track_frames(
-                context, movie, camera, windows, summary,
-                check=checked(movie, camera), pool=pool, progress=run.progress,
-                doubt=doubt, warn=run.warn,
-            )  # fmt: skip
-            if not windows.n_before:
-                run.report(*_judge_beside_particles(ready, context, windows, found.fits).findings)
-        else:
-            found = _fit_together(ready, run, context, windows, noise, summary, pool)
-    run.clock.lap("results")
-    return found if ready.kept is None else ready.kept.put_back(found)
+    `doubt` says why it may not be the background of these frames; it is empty where it is.
+    """
+
+    context: AnalysisContext
+    windows: Windows
+    noise: Noise
+    summary: Mapping[str, Any]
+    doubt: str
+
+
+class BeforeAfter(Kind):
+    """What is there in all frames after a background, and was not before."""
+
+    heading = "background"
+    keeps_parts = False
+    still = True
+    """Whether particles stay where they are in all frames."""
+
+    def find(self, ready: Prepared, run: Run) -> DetectionResult:
+        """Find particles in the frames after the background; see `Kind`."""
+        ready, windows = _sum_frames(ready, run)
+        ground = self._judged(ready, run, windows)
+        with threads(ready.config.compute.workers) as pool:
+            found = self.fitted(ready, run, ground, pool)
+        run.clock.lap("results")
+        return found if ready.kept is None else ready.kept.put_back(found)
+
+    def preview(self, ready: Prepared) -> BeforeAfterSearch:
+        """Compare some frames with the background; see `Kind`."""
+        return BeforeAfterSearch(self, ready)
+
+    def redraw(
+        self,
+        ready: Prepared,
+        table: pd.DataFrame,
+        tracks: pd.DataFrame | None,
+        summary: Mapping[str, Any],
+    ) -> Redraw:
+        """Draw events over the background; see `Kind`."""
+        del tracks, summary
+        return StoredEvents(self, ready, table).draw
+
+    def context(
+        self, ready: Prepared, windows: Windows, after: tuple[int, int]
+    ) -> tuple[AnalysisContext, Noise]:
+        """Judge the noise of the background, and make models and filter for it."""
+        config = ready.config
+        noise = judge_background(
+            ready.steady, ready.camera, windows,
+            still=self.still, additive=not config.optics.interferes,
+        )  # fmt: skip
+        context = make_context(
+            config, ready.shape, searches=1 if self.still else after[1] - after[0],
+            noise=noise.spectrum, lines=ready.lines,
+        )  # fmt: skip
+        return context, noise
+
+    def fitted(
+        self, ready: Prepared, run: Run, ground: Background, pool: ThreadPoolExecutor
+    ) -> DetectionResult:
+        """Fit the particles that are there in all frames, and sample their posteriors."""
+        context = ground.context
+        events, windows = fit_field(
+            context, ground.windows, excess_noise=ground.noise.excess, pool=pool,
+            progress=run.progress,
+        )  # fmt: skip
+        if context.config.fit.index:
+            found = list(pool.map(lambda event: with_index(context, event), events))
+            events = tuple(event for event, _ in found)
+            untold = [told for _, told in found if told]
+            run.report(index_finding(context, untold, len(untold), len(events)))
+        run.clock.lap("fit")
+        # rings of many particles that a wrong microscope leaves over look uneven too
+        cause = misfit_warning(context.config, events)
+        misfit = MODEL_MISFITS({"cause": cause}) if cause else None
+        run.report(misfit or _uneven_finding(context, ready.steady.name, windows, events))
+        repeats, empty = field_repeats(context, ready.steady, ready.camera, windows, events)
+        if context.config.fit.sigma != "measured":
+            events, changing = _flag_changing_masses(context.mode, events, repeats)
+            if changing:
+                which = count(changing, "event")
+                run.report(MASSES_CHANGE({"events": which, "sigmas": CHANGES}))
+        run.clock.lap("repeats")
+        chains: list[PosteriorResult] = []
+        interrupted = False
+        if context.config.samples_posterior:
+            chains, interrupted = _sample_posteriors(context, events, pool, run.progress)
+            run.clock.lap("posterior")
+        return DetectionResult(
+            context=context,
+            fits=table_of(context, events),
+            evidence=evidence_beside(context, events),
+            views=tuple(
+                view_of(number, event, posterior=chain)
+                for number, (event, chain) in enumerate(zip_longest(events, chains))
+            ),
+            image=contrast_image(context, windows),
+            compared=Compared.of(windows),
+            summary=ground.summary,
+            repeats=tuple(repeats),
+            empty=empty,
+            interrupted=interrupted,
+        )
+
+    def _judged(self, ready: Prepared, run: Run, windows: Windows) -> Background:
+        """Make the models, and judge noise, pixels and drift of the background."""
+        movie, config = ready.steady, ready.config
+        context, noise = self.context(ready, windows, windows.frames_after)
+        run.warm_up(context)
+        run.clock.lap("model")
+        repeated = None if self.still else repeats_warning(movie, windows)
+        uneven = None if self.still else uneven_warning(config, movie.name, windows)
+        summary: dict[str, Any] = {}
+        moved = None
+        if not context.additive:
+            summary = examine_background(movie, ready.camera, windows)
+            summary["noise_spectrum"] = noise.summary
+            moved = drift_warning(movie.name, summary)
+        run.report(*noise.findings_of(movie.name), *pixel_warnings(*windows.left_out))
+        run.report(repeated, uneven, moved)
+        run.clock.lap("background")
+        doubt = uneven or moved
+        return Background(context, windows, noise, summary, doubt.text if doubt else "")
 
 
 def _sum_frames(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
@@ -101,7 +219,7 @@ def _sum_frames(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
         return measured_windows(movie, config, camera, before, after, progress=run.progress)
 
     windows = sums(ready.steady)
-    if config.optics.scheme == "darkfield":
+    if not config.optics.interferes:
         return ready, windows
     movie, finding = without_cut_off(ready.steady, camera, windows)
     run.report(finding)
@@ -110,121 +228,139 @@ def _sum_frames(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
     return replace(ready, steady=movie), sums(movie)
 
 
-def _background(
-    ready: Prepared, run: Run, windows: Windows
-) -> tuple[AnalysisContext, Noise, dict[str, Any], str]:
-    """Make the models, and judge noise, pixels and drift of the background.
+class BeforeAfterSearch:
+    """Searches for particles that were not in the background."""
 
-    Also returned is why it may not be the background of these frames; empty where it is.
-    """
-    movie, config, camera = ready.steady, ready.config, ready.camera
-    after = windows.frames_after
-    searches = after[1] - after[0] if config.fit.mode == "track" else 1
-    context = make_context(config, ready.shape, searches=searches, lines=ready.lines)
-    run.warm_up(context)
-    run.clock.lap("model")
-    still = config.fit.mode != "track"
-    noise = judge_background(movie, camera, windows, still=still, additive=context.additive)
-    if noise.spectrum is not None:
-        context = make_context(
-            config, ready.shape, searches=searches, noise=noise.spectrum, lines=ready.lines
+    def __init__(self, kind: BeforeAfter, ready: Prepared) -> None:
+        self._movie, self._config, self._camera = ready.steady, ready.config, ready.camera
+        self._check = checked(self._movie, self._camera)
+        before, after = frame_ranges(self._movie, self._config)
+        self._after, self.longest = after, after[1] - after[0]
+        numbers = None if ready.kept is None else ready.kept.numbers
+        self._numbers = np.arange(ready.whole.shape[0]) if numbers is None else numbers
+        self.frames = self._in_file(after)
+        self.window = self.longest if kind.still else 1
+        self._windows = measured_windows(
+            self._movie, self._config, self._camera, before, (after[0], after[0] + 1)
         )
-    run.report(*noise.findings_of(movie.name), *pixel_warnings(*windows.left_out))
-    uneven = None if still else uneven_warning(config, movie.name, windows)
-    run.report(None if still else repeats_warning(movie, windows), uneven)
-    summary: dict[str, Any] = {}
-    moved = None
-    if not context.additive:
-        summary = examine_background(movie, camera, windows)
-        summary["noise_spectrum"] = noise.summary
-        moved = drift_warning(movie.name, summary)
-        run.report(moved)
-    run.clock.lap("background")
-    doubt = uneven or moved
-    return context, noise, summary, "" if doubt is None else doubt.text
+        whole = replace(self._windows, n_after=self.longest, frames_after=after)
+        self._context, _ = kind.context(ready, whole, after)
+
+    def _in_file(self, span: tuple[int, int]) -> tuple[int, int]:
+        """Give the numbers in the file of a range of the frames that are left."""
+        return int(self._numbers[span[0]]), int(self._numbers[span[1] - 1]) + 1
+
+    def context(self, window: int) -> AnalysisContext:  # noqa: ARG002
+        """Give models and threshold, which are those of every window."""
+        return self._context
+
+    def look(self, frame: int, window: int) -> Look:
+        """Compare the frames from one on with the background."""
+        context, known = self._context, self._windows
+        frame = int(np.searchsorted(self._numbers, frame))
+        frame = min(max(frame, self._after[0]), self._after[1] - window)
+        part = measure_windows(
+            self._movie, self._camera, None, (frame, frame + window),
+            level_e=1.0, power_normalization=False, check=self._check,
+        )  # fmt: skip
+        windows = replace(
+            known,
+            after_e=part.after_e,
+            n_after=window,
+            power_ratio=window / max(known.n_before, 1),
+            read_variance_after_e2=part.read_variance_after_e2,
+            masked=known.masked | part.saturated,
+            saturated=known.saturated | part.saturated,
+            frames_after=part.frames_after,
+        )
+        if self._config.background.power_normalization:
+            windows = start_power(windows)
+        image = contrast_image(context, windows)
+        wanted = self._config.detection.sign
+
+        def search(threshold: float) -> pd.DataFrame:
+            found, _ = search_field(with_threshold(context, threshold), windows)
+            rows = [
+                (c.x_px, c.y_px, c.snr, context.model.peak_contrast(c.z_nm, c.mass_kda), c.mass_kda)
+                for c in found
+            ]
+            return candidate_table(r for r in rows if context.additive or wanted * r[3] >= 0)
+
+        return Look(
+            int(self._numbers[frame]),
+            self._in_file(known.frames_before) if known.n_before else None,
+            self._in_file(windows.frames_after),
+            np.where(windows.masked, np.nan, image),
+            context.templates.threshold,
+            search,
+        )
 
 
-def _judge_beside_particles(
-    ready: Prepared, context: AnalysisContext, windows: Windows, table: pd.DataFrame
-) -> Noise:
-    """Judge the camera in pixels that no moving particle comes near; the background is known."""
-    movie, camera, (first, last) = ready.steady, ready.camera, windows.frames_after
-    frame = table["frame"].to_numpy(np.int64)
-    particles = table[["x_nm", "y_nm", "z_nm", "mass_kda"]].to_numpy(float)
-    rows, columns = ready.shape
-    field = Region((0, rows), (0, columns))
+class StoredEvents:
+    """Draws rows over a background of other frames: all together, or each in its frame."""
 
-    def without(count: int) -> FloatArray:
-        electrons = camera.to_electrons(movie.read(first, first + count))
-        for number, image in enumerate(electrons if not context.additive else ()):
-            signal = np.zeros(field.shape)
-            for x, y, z, mass in particles[frame == first + number].tolist():
-                add_signal(context, (x, y, z, mass), field, signal)
-            image /= 1 + signal
-        return electrons
+    def __init__(self, kind: BeforeAfter, ready: Prepared, table: pd.DataFrame) -> None:
+        self._kind, self._ready, self.table = kind, ready, table
+        self.before, self.after = frame_ranges(ready.steady, ready.config)
+        self.context = self.made_context()
+        self._opened = lru_cache(1)(self._open)
 
-    noise = judge_beside(
-        context, movie, camera, (first, last), (frame, particles[:, :2]), ~windows.masked, without
-    )
-    return noise.compared_with_fits(table["chi2_reduced"].to_numpy(float))
+    def made_context(self) -> AnalysisContext:
+        """Make the models."""
+        return make_context(self._ready.config, self._ready.shape, lines=self._ready.lines)
+
+    def sums(self, span: tuple[int, int]) -> Windows:
+        """Sum some frames over the background."""
+        ready = self._ready
+        return measured_windows(ready.steady, ready.config, ready.camera, self.before, span)
+
+    def _drawn(self, region: Region, rows: Sequence[int]) -> FloatArray:
+        """Draw the signal of some rows in a region."""
+        total = np.zeros(region.shape)
+        for i in rows:
+            add_signal(self.context, _place(self.table.iloc[i]), region, total)
+        return total
+
+    @property
+    def _field(self) -> Region:
+        rows, columns = self._ready.shape
+        return Region((0, rows), (0, columns))
+
+    def _open(self, span: tuple[int, int]) -> tuple[Windows, list[int]]:
+        """Give the sums, with the light that the particles leave, and the rows in them."""
+        windows, table, context = self.sums(span), self.table, self.context
+        rows = table.index[table["mass_kda"].notna() & is_event(table)]
+        frames, still = table["frame"], self._kind.still
+        here = [int(i) for i in rows if still or int(frames.iloc[i]) == span[0]]
+        if self._ready.config.background.power_normalization:
+            signal = context.left(self._drawn(self._field, here))
+            if context.additive:
+                signal = signal * photons_scale(context, windows)
+            windows = refine_power(windows, signal, additive=context.additive)
+        return windows, here
+
+    def draw(self, row: int) -> EventView:
+        """Draw a row of the table."""
+        table, context = self.table, self.context
+        frame = int(table["frame"].iloc[row])
+        windows, here = self._opened(self.after if self._kind.still else (frame, frame + 1))
+        x_nm, y_nm, z_nm, mass = _place(table.iloc[row])
+        pixel = context.pixel_nm
+        start = Candidate(x_nm / pixel, y_nm / pixel, z_nm, mass, float(table["snr"].iloc[row]))
+        region = region_around(context.roi_px, self._ready.shape, start)
+        others = self._drawn(region, [i for i in here if i != row])
+        if context.lines is not None:
+            taken = context.lines.taken(self._drawn(self._field, here))
+            others = (1 + others) / taken[region.slices] - 1
+        likelihood = region_likelihood(context, windows, region, others)
+        z_range = context.config.fit.z_range_nm
+        fit = fit_particle(likelihood, start, context.mode, z_range, level=False)
+        return view_of(int(table["event"].iloc[row]), Fitted(region, fit, likelihood))
 
 
-def _fit_together(
-    ready: Prepared,
-    run: Run,
-    context: AnalysisContext,
-    windows: Windows,
-    noise: Noise,
-    summary: dict[str, Any],
-    pool: ThreadPoolExecutor,
-) -> DetectionResult:
-    """Find and fit the particles that are there in all frames, and sample their posteriors."""
-    events, windows = fit_field(
-        context, windows, excess_noise=noise.excess, pool=pool, progress=run.progress
-    )
-    if context.config.fit.index:
-        found = list(pool.map(lambda event: with_index(context, event), events))
-        events = tuple(event for event, _ in found)
-        untold = [told for _, told in found if told]
-        n_sample = context.model.optics.n_sample
-        if text := untold_message(untold, len(untold), len(events), n_sample):
-            run.warn(text)
-    run.clock.lap("fit")
-    # rings of many particles that a wrong microscope leaves over look uneven too
-    cause = misfit_warning(context.config, events)
-    misfit = MODEL_MISFITS({"cause": cause}) if cause else None
-    run.report(misfit or _uneven_finding(context, ready.steady.name, windows, events))
-    repeats, empty = field_repeats(context, ready.steady, ready.camera, windows, events)
-    if context.config.fit.sigma != "measured":
-        events, changing = _flag_changing_masses(context.mode, events, repeats)
-        if changing:
-            run.warn(
-                f"the mass of {count(changing, 'event')} changes within the frames by more than "
-                f"{CHANGES:g} times its error, flagged poor_fit: they land, leave or move there; "
-                "let background.frames end before they land and fit.frames begin after"
-            )
-    run.clock.lap("repeats")
-    chains: list[PosteriorResult] = []
-    interrupted = False
-    if context.config.samples_posterior:
-        chains, interrupted = _sample_posteriors(context, events, pool, run.progress)
-        run.clock.lap("posterior")
-    return DetectionResult(
-        context=context,
-        fits=table_of(context, events),
-        evidence=evidence_beside(context, events),
-        views=tuple(
-            view_of(number, event, posterior=chain)
-            for number, (event, chain) in enumerate(zip_longest(events, chains))
-        ),
-        image=contrast_image(context, windows),
-        compared=Compared.of(windows),
-        heading="background",
-        summary=summary,
-        repeats=tuple(repeats),
-        empty=empty,
-        interrupted=interrupted,
-    )
+def _place(row: pd.Series[Any]) -> PlaceAndMass:
+    x, y, z, mass = (float(row[name]) for name in ("x_nm", "y_nm", "z_nm", "mass_kda"))
+    return x, y, z, mass
 
 
 def _uneven_finding(

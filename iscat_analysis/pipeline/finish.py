@@ -2,12 +2,14 @@
 
 A fit knows the error of its own likelihood.  Calibration errors, the spread of an event's own
 frames and the ratio of the measured spread to the bound follow from all events together.  With
-``fit.sigma = "measured"`` the σ in a row is already the measured one.
+``fit.sigma = "measured"`` the σ in a row is already the measured one.  ``summary.json`` has counts,
+medians, precision and species of all events, and a course in time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
@@ -16,10 +18,13 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from iscat_analysis.bounds import holevo_over_quantum
 from iscat_analysis.calibration import as_given
-from iscat_analysis.config import config_to_toml
+from iscat_analysis.camera import Camera, FieldSample, Pattern, middle_of, pattern_of
+from iscat_analysis.config import MODES, MOVES, Config, config_to_toml
 from iscat_analysis.diagnosis import (
     Prepared,
+    Stretches,
     fixed_height_warning,
     landing_rate_warning,
     large_warning,
@@ -30,11 +35,16 @@ from iscat_analysis.diagnosis import (
     sign_warning,
 )
 from iscat_analysis.executors import versions
+from iscat_analysis.findings import Finding, remark
+from iscat_analysis.findings.particles import SPREAD_NOT_MEASURED
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.nuisances import Evidence
-from iscat_analysis.pipeline.summary import species_of, summary_of, timeline_of
+from iscat_analysis.movie import Stack
+from iscat_analysis.optics.field_map import changes_at, terms_of, when
+from iscat_analysis.pipeline.kinds import Kind
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     Analysis,
@@ -45,11 +55,20 @@ from iscat_analysis.records import (
     Status,
     TrackStatus,
     flagged,
+    free_parameters,
+    is_event,
     is_rejected,
     make_rows,
     silent,
+    species_rows,
+    tally,
     with_diameters,
 )
+from iscat_analysis.report.numbers import number
+from iscat_analysis.search.frames import DARK, measure_frames, well_lit
+from iscat_analysis.species import LEAST_EVENTS, describe
+from iscat_analysis.species.diameters import Sizes, describe_sizes
+from iscat_analysis.species.tables import filter_efficiency, shared_error
 from iscat_analysis.text import printable
 from iscat_analysis.threads import start_in_thread
 from iscat_analysis.trust.budget import SCALE, SPHERES, budget_of, explained_kda, width_warning
@@ -66,6 +85,407 @@ from iscat_analysis.trust.heights import Heights
 from iscat_analysis.trust.pairs import told_as_pairs, with_masses_of_pairs
 from iscat_analysis.trust.systematic import contributions, misfit_error, total
 from iscat_analysis.trust.uneven_reference import reference_warning
+from iscat_analysis.units import count
+
+_PLACES, _TOGETHER = 48, 6  # where some frames are looked at, and how many
+_FEWEST = 3  # of these that must have light
+_BINS = 40  # of time, in which events are counted
+_LIT = 0.1  # of the median pixel's light, which one that tells the noise has
+_PATTERN_PX = 256  # side of the part of a field whose pattern is followed
+_MOST_INTERVALS = 200
+_DROPPED = "dark, cut off, or the same as the frame before: left out"
+_HIDDEN = "partly hidden by bright or ill-described particles"
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What some frames next to each other show; nothing where they have no light.
+
+    Of a large field, the noise is that of a sample of its pixels, and the image that of its middle.
+    """
+
+    light_e: float = math.nan
+    noise: float = math.nan
+    image: FloatArray | None = None
+
+
+def timeline_of(ready: Prepared, found: DetectionResult, table: pd.DataFrame) -> dict[str, Any]:
+    """Say what was where in a movie, on one axis of frames."""
+    first, last = _span(found.compared)
+    if first == last:  # it was interrupted before any frame was done
+        return {}
+    together = min(_TOGETHER, last - first)
+    starts = np.unique(np.linspace(first, last - together, _PLACES).astype(int)).tolist()
+    kept = ready.stretches.kept if ready.stretches.breaks else ((first, last),)
+    inside = [next((k for k, s in enumerate(kept) if s[0] <= f < s[1]), None) for f in starts]
+    seen = [
+        Seen() if held is None else look_at(ready.whole, ready.camera, start, start + together)
+        for start, held in zip(starts, inside, strict=True)
+    ]
+    drift_y, drift_x = _drift(seen, inside, additive=found.context.additive)
+    return {
+        "frames": [start + (together - 1) / 2 for start in starts],
+        "light_e": _numbers([one.light_e for one in seen]),
+        "noise_over_expected": _numbers([one.noise for one in seen]),
+        "focus_nm": _focus(found.context.config, starts),
+        "drift_x_px": drift_x,
+        "drift_y_px": drift_y,
+        "intervals": list(_intervals(ready.stretches, found)),
+        "events": _events(table, first, last),
+    }
+
+
+def _span(compared: Compared) -> tuple[int, int]:
+    """Give the first frame that was used, and one past the last."""
+    spans = [s for s in (compared.frames_before, compared.frames_after) if s[1] > s[0]] or [(0, 0)]
+    return min(s[0] for s in spans), max(s[1] for s in spans)
+
+
+def look_at(movie: Stack, camera: Camera, start: int, stop: int) -> Seen:
+    """Measure light and noise of some frames, and the middle of their mean image."""
+    counts = movie.read(start, stop)
+    light, repeats = measure_frames(counts, camera)
+    good = well_lit(light, DARK) & ~repeats
+    if good.sum() < _FEWEST:
+        return Seen()
+    few, theirs = counts[good], camera
+    sample = FieldSample.of((movie.shape[1], movie.shape[2]))
+    if sample is not None:
+        few, theirs = sample.taken(few), sample.camera(camera)
+    electrons = theirs.to_electrons(few)
+    power = electrons.mean(axis=(1, 2), keepdims=True)
+    if power.min() <= 0:
+        return Seen()
+    steady = power.mean() / power
+    electrons *= steady
+    mean = electrons.mean(axis=0)
+    used = (mean > _LIT * float(np.median(mean))) & ~theirs.saturated(few.max(axis=0))
+    expected = mean + theirs.dark_variance_e2(few)
+    noise = math.nan
+    if used.any():
+        steps = np.mean(np.diff(electrons, axis=0) ** 2, axis=0)
+        noise = float(steps[used].sum() / (2 * expected[used].sum()))
+    middle = middle_of(movie.shape, _PATTERN_PX)
+    image = camera.part(middle).to_electrons(counts[good][..., *middle]) * steady
+    return Seen(float(light[good].mean()), noise, image.mean(axis=0))
+
+
+def _drift(
+    seen: Sequence[Seen], inside: Sequence[int | None], *, additive: bool
+) -> tuple[list[float | None], list[float | None]]:
+    """Follow the fixed pattern within each stretch, from where the one before ended."""
+    moved = np.full((len(seen), 2), np.nan)
+    reference: Pattern | None = None
+    begun: int | None = None
+    origin, latest = np.zeros(2), np.zeros(2)
+    for k, (one, held) in enumerate(zip(seen, inside, strict=True)):
+        if one.image is None or additive:
+            continue
+        pattern = pattern_of(one.image)
+        if held != begun or reference is None:
+            reference, begun, origin = pattern, held, latest
+        shift = np.array(pattern.shift_from(reference))
+        if np.isfinite(shift).all():
+            moved[k] = latest = origin + shift
+    return _numbers(moved[:, 0]), _numbers(moved[:, 1])
+
+
+def _focus(config: Config, starts: Sequence[int]) -> list[float | None]:
+    """Give the focus with which each part was fitted."""
+    optics = config.optics
+    moves = {name: size for name, size in terms_of(optics).items() if name in MOVES}
+    rises = [changes_at(moves, when(optics, frame)).get("focus_nm", 0.0) for frame in starts]
+    return _numbers([optics.focus_nm + rise for rise in rises])
+
+
+def _intervals(stretches: Stretches, found: DetectionResult) -> Iterator[dict[str, Any]]:
+    """Name the frames that are flagged."""
+    for one in stretches.breaks:
+        yield {"start": one.start, "stop": one.stop, "what": one.cause}
+    for start, stop, _ in (found.summary or {}).get("partly_searched", ()):
+        yield {"start": int(start), "stop": int(stop), "what": _HIDDEN}
+    compared, begin, number = found.compared, 0, 0
+    for first, last in (compared.frames_before, compared.frames_after):
+        light = compared.power[begin : begin + last - first]
+        begin += last - first
+        lost = ~np.isfinite(light)
+        for one in stretches.breaks:
+            lost[max(one.start - first, 0) : max(one.stop - first, 0)] = False
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], lost.astype(np.int8), [0]])))
+        for start, stop in edges.reshape(-1, 2).tolist():
+            number += 1
+            if number <= _MOST_INTERVALS:
+                yield {"start": first + start, "stop": first + stop, "what": _DROPPED}
+
+
+def _events(table: pd.DataFrame, first: int, last: int) -> dict[str, Any]:
+    """Count events in equal parts of the movie, those that are ok and others."""
+    edges = np.unique(np.linspace(first, last, _BINS + 1).astype(int))
+    frame = table["frame"].to_numpy(float)
+    ok = (table["status"] == Status.OK.value).to_numpy()
+    others = ~ok & is_event(table)
+    return {
+        "edges": edges.tolist(),
+        "ok": np.histogram(frame[ok], edges)[0].tolist(),
+        "flagged": np.histogram(frame[others], edges)[0].tolist(),
+    }
+
+
+def _numbers(values: Sequence[float] | NDArray[np.float64]) -> list[float | None]:
+    """Give numbers, and nothing where there is none."""
+    return [float(value) if math.isfinite(value) else None for value in values]
+
+
+_HEIGHTS = 65
+"""Heights at which the Holevo bound is computed for a table; linear in between."""
+
+_CLEAR_OF_THRESHOLD = 3.0
+"""Standard deviations above the threshold from which hardly any sphere is missed."""
+
+_NO_SIZE = {
+    TrackStatus.POOR_FITS,
+    TrackStatus.AMBIGUOUS_SIZE,
+    TrackStatus.OTHER_PARTICLE,
+    TrackStatus.MASS_VARIES,
+}
+"""Flags of tracks of which pictures do not tell the diameter."""
+
+
+def summary_of(
+    context: AnalysisContext,
+    table: pd.DataFrame,
+    compared: Compared,
+    timings: Mapping[str, float],
+    achieved: Mapping[str, EmpiricalSpread] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """Gather counts, medians and efficiency, for ``summary.json``; `species_of` has the rest."""
+    rows = tally(table)
+    good = table[table["status"] == Status.OK]
+    free = free_parameters(context.mode, table)
+    conflict = {"z_nm", "mass_kda"} <= set(free) and len(good) > 0
+    cost = _holevo_over_quantum(context, good["z_nm"].to_numpy(float)) if conflict else {}
+    precision = {}
+    for name in free:
+        sigma, crb, qcrb = (good[f"{kind}_{name}"] for kind in ("sigma", "crb", "qcrb"))
+        reachable = qcrb * cost.get(name, 1.0)
+        precision[name] = {
+            "sigma_median": _median(sigma),
+            "crb_median": _median(crb),
+            **({"holevo_median": _median(reachable)} if conflict else {}),
+            "qcrb_median": _median(qcrb),
+            "sigma_over_crb_median": _median(sigma / crb),
+            "information_fraction_median": _median((reachable / crb) ** 2),
+        }
+        if name in achieved:
+            precision[name] |= _repeats(achieved[name])
+        if f"systematic_{name}" in good:
+            precision[name]["systematic_median"] = _median(good[f"systematic_{name}"])
+    return {
+        "mode": context.mode,
+        "scheme": context.model.optics.scheme,
+        "emission": context.model.optics.emission,
+        "convention": context.model.optics.convention,
+        "mass_scale": mass_scale_of(context.config),
+        **_scale_transfer(context),
+        "events": rows.number,
+        "status": dict(sorted(rows.status.items())),
+        **({"no_events": rows.left_out} if rows.left_out else {}),
+        "frames_before": list(compared.frames_before),
+        "frames_after": list(compared.frames_after),
+        "power_ratio": compared.power_ratio,
+        "power_spread": _spread(compared.power),
+        "masked_pixels": compared.masked_pixels,
+        "detection_threshold_snr": context.templates.threshold,
+        "medians": {
+            "mass_kda": _median(good["mass_kda"]),
+            "contrast": _median(good["contrast"]),
+            "n_scattered": _median(good["n_scattered"]),
+        },
+        "precision": precision,
+        "distribution": None,
+        "across_particles": [],
+        "seconds": {name: round(value, 3) for name, value in timings.items()},
+    }
+
+
+def _scale_transfer(context: AnalysisContext) -> dict[str, Any]:
+    """Describe how the mass scale was transferred from the optics of its standards."""
+    scale = context.model.scale
+    if scale.calibration is None:
+        return {}
+    return {
+        "scale": {
+            "carried": scale.carried,
+            "optics": "configured" if scale.calibration.optics_assumed else "recorded",
+            "refusal": scale.refusal or None,
+        }
+    }
+
+
+def species_of(
+    context: AnalysisContext,
+    table: pd.DataFrame,
+    searched: float | None = None,
+    tracks: pd.DataFrame | None = None,
+) -> dict[str, Any]:
+    """Describe the species of all events, or the sizes of all spheres.
+
+    `searched` is the share of field and time that was searched.
+    """
+    if context.config.fits_sizes:
+        seed = context.config.compute.seed
+        found = sizes_of_tracks(tracks, seed) if tracks is not None else _sizes(context, table)
+        return {
+            "distribution": None,
+            "across_particles": [],
+            "sizes": None if found is None else found.to_dict(),
+        }
+    used, notes = species_rows(table)
+    distribution = _distribution(context, used, searched or 1.0)
+    if distribution is not None:
+        distribution["notes"].extend(notes)
+    return {"distribution": distribution, "across_particles": species_width(used, distribution)}
+
+
+def _sizes(context: AnalysisContext, table: pd.DataFrame) -> Sizes | None:
+    """Describe the diameters of spheres that were fitted once each, of rows that are ok."""
+    good = table[table["status"] == Status.OK]
+    diameter, sigma, snr = (
+        good[name].to_numpy(float) for name in ("diameter_nm", "sigma_diameter_nm", "snr")
+    )
+    notes = []
+    near = diameter[snr < context.templates.threshold + _CLEAR_OF_THRESHOLD]
+    if near.size:
+        notes.append(
+            f"{count(near.size, 'sphere')} of {number(near.min())} to {number(near.max())} nm "
+            f"{'is' if near.size == 1 else 'are'} hardly brighter than what is detected: others of "
+            "such diameters were missed, for which nothing is corrected"
+        )
+    common = 0.0
+    if "systematic_diameter_nm" in good:
+        common = _median(good["systematic_diameter_nm"] / good["diameter_nm"]) or 0.0
+    return describe_sizes(
+        diameter, sigma, seed=context.config.compute.seed, common=common, notes=notes
+    )
+
+
+def sizes_of_tracks(tracks: pd.DataFrame, seed: int) -> Sizes | None:
+    """Describe the diameters that the pictures of tracks show.
+
+    What is wrong with the motion of a track says nothing of its pictures, and leaving out those
+    that are near the wall would leave out the large ones.
+    """
+    if "optical_diameter_nm" not in tracks:
+        return None
+    flags = tracks["flags"].astype(str).str.split(";")
+    good = tracks[[not _NO_SIZE & set(each) for each in flags]]
+    notes = []
+    if len(good) < len(tracks):
+        notes.append(
+            f"{count(len(tracks) - len(good), 'track')} of {len(tracks)} left out, of which "
+            "pictures do not tell the diameter, or do not agree on it"
+        )
+    common = 0.0
+    if "systematic_mass_kda" in good:  # a third, as the mass goes with the cube of the diameter
+        common = (_median(good["systematic_mass_kda"] / good["mass_kda"]) or 0.0) / 3
+    return describe_sizes(
+        good["optical_diameter_nm"].to_numpy(float),
+        good["sigma_optical_diameter_nm"].to_numpy(float),
+        seed=seed,
+        common=common,
+        notes=notes,
+    )
+
+
+def _repeats(found: EmpiricalSpread) -> dict[str, Any]:
+    """Summarise a measured spread."""
+    return {
+        "repeat_over_crb": found.over_crb,
+        "repeat_over_crb_ci95": list(found.ci95),
+        "repeat_significance": found.significance,
+        "repeat_events": found.events,
+        "repeat_whole": found.whole,
+        "repeat_frames": list(found.frames),
+        "repeat_over_crb_by_frames": list(found.by_frames),
+        "repeat_over_crb_by_frames_se": list(found.by_frames_se),
+        "empty_over_crb": list(found.empty),
+    }
+
+
+def _holevo_over_quantum(context: AnalysisContext, z_nm: FloatArray) -> dict[str, FloatArray]:
+    """Cost of fitting height and mass at once, of each particle, by parameter.
+
+    It depends on the height through the evanescent waves alone, and smoothly.
+    """
+    free = FREE_PARAMETERS[context.mode]
+    heights = np.linspace(max(z_nm.min(), 0.0), max(z_nm.max(), 1.0), _HEIGHTS)
+    costs = [holevo_over_quantum(context.model, float(z), free) for z in heights]
+    return {name: np.interp(z_nm, heights, [cost[name] for cost in costs]) for name in free}
+
+
+def _distribution(
+    context: AnalysisContext, good: pd.DataFrame, searched: float
+) -> dict[str, Any] | None:
+    """Describe the species where masses were fitted, each event once.
+
+    The matched filter's standard deviation is what its snr makes of each mass.
+    """
+    if "mass_kda" not in FREE_PARAMETERS[context.mode] or context.mode == "track":
+        return None
+    mass, sigma = (good[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
+    efficiency = None
+    if len(good) >= LEAST_EVENTS:  # fewer have no species whose numbers it would correct
+        efficiency = filter_efficiency(good, context.templates.threshold, searched)
+    found = describe(
+        mass,
+        sigma,
+        efficiency=efficiency,
+        seed=context.config.compute.seed,
+        scale_error=shared_error(good),
+        window_frames=int(good["n_after"].max()) if len(good) else None,
+    )
+    return found.to_dict()
+
+
+def species_width(
+    used: pd.DataFrame, distribution: Mapping[str, Any] | None
+) -> list[dict[str, Any]]:
+    """Compare the width of each species with the σ of its events."""
+    found = distribution["species"] if distribution is not None else []
+    species = [one for one in found if not one.get("background")]
+    if not species:
+        return []
+    means = np.array([one["mass_kda"] for one in species])
+    sizes = used["mass_kda"].abs().to_numpy(float)
+    nearest = np.argmin(np.abs(sizes[:, None] - means), axis=1)
+    across = []
+    for k, one in enumerate(species):
+        sigma_median = _median(used["sigma_mass_kda"].to_numpy(float)[nearest == k])
+        if one["outlier"] or not sigma_median:
+            continue
+        keys = ("mass_kda", "width_kda", "width_low", "width_high", "count")
+        over = np.hypot(1.0, one["width_kda"] / sigma_median)
+        across.append({**{key: one[key] for key in keys}, "spread_over_sigma": float(over)})
+    return across
+
+
+def _median(values: pd.Series[float] | FloatArray) -> float | None:
+    finite = np.asarray(values, dtype=float)
+    finite = finite[np.isfinite(finite)]
+    return float(np.median(finite)) if finite.size else None
+
+
+def _spread(power: FloatArray) -> float:
+    """Give the standard deviation of the light of the frames in which it is known."""
+    known = power[np.isfinite(power)]
+    return float(np.std(known)) if known.size else 0.0
+
+
+def mass_scale_of(config: Config) -> str:
+    """Say where the masses come from: standards, the volume of spheres, or the model alone."""
+    if config.fits_sizes:
+        return "volume and density"
+    return "calibration" if config.calibration else "absolute model"
 
 
 @dataclass(frozen=True)
@@ -109,7 +529,7 @@ def reported_rows(
     changing_light = ""
     shared_place = np.zeros(len(fits), dtype=bool)
     resolution_nm = config.optics.wavelength_nm / config.optics.na
-    if found.heading == "landing":
+    if config.background.slides:
         shared_place = at_a_shared_place(fits, resolution_nm)
         fits = flagged(fits, Status.CHANGING, shared_place)
         if evidence is not None:
@@ -122,7 +542,7 @@ def reported_rows(
     if not scale:  # which has all that the frames show
         fluctuation = Fluctuation.of(mode, found.fits, found.repeats, achieved, shared_place)
     if fluctuation is not None:
-        if found.heading == "landing" and fluctuation.is_seen:
+        if config.background.slides and fluctuation.is_seen:
             wide = at_a_shared_place(fits, resolution_nm, fluctuation.relative)
             fits = flagged(fits, Status.CHANGING, wide)
         sigma = np.sqrt(fits["sigma_mass_kda"] ** 2 + fluctuation.variance_kda2)
@@ -130,13 +550,13 @@ def reported_rows(
     columns: dict[str, pd.Series | FloatArray] = {
         name: fits[name] * factor for name, factor in scale.items()
     }
-    if mode == "track":
+    unfit, threshold = misfit_error(fits, found.context.roi_px**2), 0.0
+    if not MODES[mode].follows_tracks:
+        threshold = found.context.templates.threshold
+    elif optics:  # which were tested
         from iscat_analysis.tracking.tracked_optics import mass_error
 
         unfit = mass_error(optics)
-    if mode != "track" or not optics:  # the optics were not tested
-        unfit = misfit_error(fits, found.context.roi_px**2)
-    threshold = 0.0 if mode == "track" else found.context.templates.threshold
     shared = contributions(
         config, fits, unfit, found.context.model.scale, shifts, camera, threshold, optics
     )
@@ -168,7 +588,26 @@ def _with_changing(
     return flagged(fits, Status.CHANGING, unseen), text
 
 
+CHECKS: tuple[Callable[[DetectionResult, pd.DataFrame], Finding | None], ...] = (
+    lambda found, _: scale_warning(found.context.model.scale),
+    lambda found, table: line_warning(found.context.config, table),
+    lambda found, table: nonlinearity_warning(found.context.model.scale, table),
+    lambda found, table: sign_warning(found.context.config, table),
+    lambda found, table: large_warning(found.context.config, table),
+    lambda found, table: landing_rate_warning(table) if _slides(found) else None,
+    lambda found, table: (
+        residue_warning(table, found.summary["window_frames"]) if _slides(found) else None
+    ),
+)
+"""What the events of a movie and the table of their rows tell together."""
+
+
+def _slides(found: DetectionResult) -> bool:
+    return found.context.config.background.slides
+
+
 def make_analysis(
+    kind: Kind,
     ready: Prepared,
     run: Run,
     found: DetectionResult,
@@ -185,9 +624,7 @@ def make_analysis(
         progress = silent  # another stage would end the time that writing is given
     context, compared = found.context, found.compared
     config = context.config
-    further = {**ready.summary}
-    if found.summary:
-        further[found.heading] = found.summary
+    further = {**ready.summary, **({kind.heading: found.summary} if found.summary else {})}
     if found.optics:
         further["optics"] = found.optics
     further |= extra
@@ -201,7 +638,7 @@ def make_analysis(
         table = flagged(table, flag)
     scale = context.model.scale
     if rows.changing_light:
-        run.warn(rows.changing_light)
+        run.report(remark(rows.changing_light))
     for name, finding in (
         ("heights", rows.heights),
         ("extension", rows.extension),
@@ -210,20 +647,10 @@ def make_analysis(
         if finding is not None:
             further[name] = finding.summary
             if finding.message:
-                run.warn(finding.message)
-    sliding = ready.background_mode == "sliding"
-    window = found.summary["window_frames"] if sliding and found.summary else None
-    run.report(
-        scale_warning(scale),
-        line_warning(config, table),
-        nonlinearity_warning(scale, table),
-        sign_warning(config, table),
-        large_warning(config, table),
-        landing_rate_warning(table) if sliding else None,
-        None if window is None else residue_warning(table, window),
-    )
+                run.report(remark(finding.message))
     if reference := reference_warning(config, table):
-        run.warn(reference)
+        run.report(remark(reference))
+    run.report(*(check(found, table) for check in CHECKS))
     scaled = config.fit.sigma == "measured"
     if found.repeats:
         seen = rows.fluctuation is not None and rows.fluctuation.is_seen
@@ -233,31 +660,27 @@ def make_analysis(
             found.summary,
             scaled=scaled,
             rejected=is_rejected(table),
-            sliding=ready.background_mode == "sliding",
+            sliding=config.background.slides,
         )
         further["repeats"] = verdict
         if verdict["message"]:
-            run.warn(verdict["message"])
+            run.report(remark(verdict["message"]))
     elif scaled and len(table):
-        run.warn(
-            'fit.sigma = "measured" has no effect: the spread is not measured where the background '
-            "is learnt with the tracks, and σ is that of the likelihood"
-        )
+        run.report(SPREAD_NOT_MEASURED())
     tracks: pd.DataFrame | None = None
     films: tuple[Film, ...] = ()
     if found.followed is not None:
         from iscat_analysis.tracking.common_motion import warnings_of
         from iscat_analysis.tracking.tracks import make_films, tracks_of
 
-        followed = found.followed
+        followed, texts = found.followed, list[str]()
         tracks, track_summary = tracks_of(
             context, table, followed.windows,
-            masses=followed.masses, ticks=ticks, warn=run.warn, progress=progress,
+            masses=followed.masses, ticks=ticks, warn=texts.append, progress=progress,
         )  # fmt: skip
         further |= track_summary
-        for text in warnings_of(table, config.camera.frame_rate_hz, ticks):
-            run.warn(text)
-        run.report(fixed_height_warning(config, table))
+        texts += warnings_of(table, config.camera.frame_rate_hz, ticks)
+        run.report(*map(remark, texts), fixed_height_warning(config, table))
         backgrounds = followed.parts or (followed.windows,)
         films = make_films(context, ready.steady, ready.camera, backgrounds, table, tracks)
         run.clock.lap("tracks")
@@ -273,7 +696,7 @@ def make_analysis(
     calibrated = config.calibration is not None or config.fits_sizes
     wide = width_warning(described["across_particles"], calibrated=calibrated)
     if wide:
-        run.warn(wide)
+        run.report(remark(wide))
     timeline = timeline_future.result()
     summary = summary_of(context, table, compared, run.clock.seconds, achieved)
     provenance = Provenance(

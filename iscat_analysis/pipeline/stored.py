@@ -11,10 +11,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from iscat_analysis.config import Config, load_config
+from iscat_analysis.diagnosis import calibrated
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import path_in
 from iscat_analysis.movie import Stack, open_stack, split_address
-from iscat_analysis.pipeline.redraw import Redraw, redraw
+from iscat_analysis.pipeline.kinds import Redraw, kind_of
 from iscat_analysis.reading import read_json, read_parquet
 from iscat_analysis.records import EventView, tally
 from iscat_analysis.report.answer import answer_in
@@ -153,7 +154,9 @@ class StoredResult:
                     f"{movie.path}: is not the movie of {self.folder.name} (its SHA-256 differs "
                     f"from {expected[:12]}…); give the one that was analysed"
                 )
-            return movie, redraw(movie, self.config, self.table, self.tracks, self.summary)
+            ready = calibrated(movie, self.config).over_all_stretches()
+            kind = kind_of(ready.config)
+            return movie, kind.redraw(ready, self.table, self.tracks, self.summary)
         except BaseException:
             movie.close()
             raise

@@ -354,7 +354,6 @@ def plan_parts(
     reader: Reader,
     config: Config,
     window: int,
-    stride: int,
     stretch: tuple[int, int] | None = None,
     *,
     in_place: bool = True,
@@ -365,14 +364,15 @@ def plan_parts(
     where they are made in place.
     """
     first, last = stretch or (reader.first, reader.last)
-    plan = plan_chunks(reader, config, window, stride, (first, last))
+    stride = stride_of(window)
+    plan = plan_chunks(reader, config, window, (first, last))
     if plan:
         return [[Part(core, span)] for core, span in plan]
-    parts, core = choose_tiles(reader, config, window, stride, last - first, in_place=in_place)
+    parts, core = choose_tiles(reader, config, window, last - first, in_place=in_place)
     tiles = cut_field(reader.shape, parts, halo_px(config))
     count = math.ceil((last - first) / core)
     even = math.ceil((last - first) / count / stride) * stride
-    halo = halo_frames(window, stride)
+    halo = halo_frames(window)
     every = max(1, count * len(tiles) // _CONTROLLED)
     return [
         [
@@ -397,16 +397,17 @@ def _roi_px(config: Config) -> int:
     return config.fit.roi_px(config.camera.pixel_size_nm or math.nan)
 
 
-def halo_frames(window: int, stride: int) -> int:
+def halo_frames(window: int) -> int:
     """Length of the halo of a chunk."""
+    stride = stride_of(window)
     return math.ceil(HALO * window / stride) * stride
 
 
 def choose_tiles(
-    reader: Reader, config: Config, window: int, stride: int, frames: int, *, in_place: bool
+    reader: Reader, config: Config, window: int, frames: int, *, in_place: bool
 ) -> tuple[tuple[int, int], int]:
     """Choose rows and columns of tiles, and the frames of a core, that look at least at halos."""
-    side, halo = halo_px(config), halo_frames(window, stride)
+    side, halo, stride = halo_px(config), halo_frames(window), stride_of(window)
     smallest = _roi_px(config)
     per_block = _SUM_BYTES + _moving_bytes(config) + (0 if in_place else _MAP_BYTES)
     budget, per_frame = _TILE_SHARE * counts_budget(config), per_block / stride
@@ -455,11 +456,11 @@ def _moving_bytes(config: Config) -> int:
 
 
 def plan_chunks(
-    reader: Reader, config: Config, window: int, stride: int, stretch: tuple[int, int] | None = None
+    reader: Reader, config: Config, window: int, stretch: tuple[int, int] | None = None
 ) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     """Divide a movie, or a stretch of it, whose field is not divided; empty where it has to be."""
     first, last = stretch or (reader.first, reader.last)
-    halo = halo_frames(window, stride)
+    halo, stride = halo_frames(window), stride_of(window)
     budget = counts_budget(config)
     # beside counts and blocks, the field holds some images in doubles
     pixels = math.prod(reader.shape)
@@ -491,8 +492,7 @@ def sum_first_chunk(reader: Reader, config: Config, window: int) -> None:
     """
     if not reader.in_place:
         return
-    stride = stride_of(window)
-    first, *_ = plan_parts(reader, config, window, stride)[0]
+    first, *_ = plan_parts(reader, config, window)[0]
     if first.tile is None:
         with threads(config.compute.workers) as pool:
-            reader.chunk(first.span, stride, pool)
+            reader.chunk(first.span, stride_of(window), pool)

@@ -16,9 +16,7 @@ Where heights are fitted no two frames show the same: each is a picture of its o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,16 +61,6 @@ class Aligned:
     read_e2: FloatArray
     theta: FloatArray
     frames: IntArray
-
-    def packed(self) -> dict[str, NDArray[Any]]:
-        """Give the arrays that are saved."""
-        return {f"aligned_{part.name}": getattr(self, part.name) for part in fields(self)}
-
-    @classmethod
-    def unpacked(cls, data: Mapping[str, NDArray[Any]]) -> Aligned | None:
-        """Make it of saved arrays; None where there are none."""
-        names = [f"aligned_{part.name}" for part in fields(cls)]
-        return cls(*(data[name] for name in names)) if names[0] in data else None
 
     def likelihood(self, context: AnalysisContext, number: int) -> Likelihood:
         """Give the likelihood of a picture of a particle that stands still."""

@@ -15,7 +15,7 @@ from iscat_analysis._kernels.canvas import box_of
 from iscat_analysis.camera import Camera
 from iscat_analysis.diagnosis import Noise, judge_beside, smear_warning
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.run import Checkpoint, packed_views, unpacked_views
+from iscat_analysis.fitting.run import Checkpoint
 from iscat_analysis.records import BoolArray, CountSource, EventView, FloatArray, Progress, Windows
 from iscat_analysis.threads import start_in_thread
 from iscat_analysis.tracking.aligned import Aligned, align
@@ -162,53 +162,4 @@ def row_view(
 class BlockStore(Checkpoint):
     """Results of blocks on disk."""
 
-    def load(self, number: int, span: tuple[int, int]) -> Block | None:
-        """Give a finished block, or None."""
-        found = self.read(number)
-        if found is None or tuple(found[1].get("span", ())) != span:
-            return None
-        table, data = found
-        try:
-            numbers = data["events"].tolist()
-            views = unpacked_views(data)
-            names = [str(name) for name in data["mass_names"]]
-            masses = pd.DataFrame(data["masses"], columns=names)
-            return Block(
-                span=span,
-                rows=Localizations.of(data["frame"], data["track"], data["theta"], data["group"]),
-                error=float(data["error"]),
-                table=table,
-                inside=data["inside"],
-                masses=masses.set_index(pd.Index(np.arange(len(masses)), name="track")),
-                views=tuple(replace(v, event=n) for n, v in zip(numbers, views, strict=True)),
-                level=data["level"],
-                power=data["power"],
-                total_e=data["total_e"],
-                used=data["used"],
-                saturated=data["saturated"],
-                noise=tuple(str(text) for text in data["noise"]),
-                noise_differs=bool(data["noise_differs"]),
-                aligned=Aligned.unpacked(data),
-            )
-        except (ValueError, KeyError):
-            return None
-
-    def save(self, number: int, block: Block) -> None:
-        """Keep a finished block."""
-        rows = block.rows
-        arrays = {
-            "span": np.array(block.span),
-            "frame": rows.frame, "track": rows.track, "theta": rows.theta, "group": rows.group,
-            "error": np.array(block.error),
-            "inside": block.inside,
-            "masses": block.masses.to_numpy(float),
-            "mass_names": np.array(list(block.masses.columns)),
-            "events": np.array([view.event for view in block.views], dtype=np.int64),
-            **packed_views(block.views),
-            "level": block.level, "power": block.power, "total_e": block.total_e,
-            "used": block.used, "saturated": block.saturated,
-            "noise": np.array(block.noise, dtype=np.str_),
-            "noise_differs": np.array(block.noise_differs),
-            **({} if block.aligned is None else block.aligned.packed()),
-        }  # fmt: skip
-        self.write(number, block.table, arrays)
+    records = (*Checkpoint.records, Block, Localizations, Aligned)

@@ -134,7 +134,6 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
         views=joined.views,
         image=windows.after_e / windows.before_e - 1,
         compared=Compared.of(windows),
-        heading="blocks",
         summary=plan.summary,
         followed=joined.followed,
         optics=learned,
@@ -248,8 +247,8 @@ def _analysed(
     """Load a finished block, or analyse it."""
     count, span = len(plan.spans), plan.spans[number]
     block_progress = progress if count == 1 else _part_of(progress, number, count)
-    block = store.load(number, span)
-    if block is not None:
+    block: Block | None = store.load(number)
+    if block is not None and block.span == span:
         block_progress("track", 1, 1)
         return block
     block = analyse_block(
@@ -344,7 +343,6 @@ def track_frames(
         views=tuple(seen[number] for number in sorted(seen)),
         image=contrast_image(context, windows),
         compared=Compared.of(windows),
-        heading="background",
         summary=summary,
         repeats=tuple(repeats[row] for row in order),
         empty=noise.spread if noise else None,

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from iscat_analysis.bounds import eliminated, imitation, joint_information, peak_gradient
 from iscat_analysis.config import ABERRATIONS, Config, Optics, OpticsCovariance
@@ -169,7 +169,7 @@ class Response:
             return float(np.log1p(np.exp(log_number) * values).sum()) - gained
 
         least, most = np.log(gained / values.sum()), gained - np.log(values.max())
-        number = np.exp(brentq(beyond, least, most))
+        number = np.exp(scipy.optimize.brentq(beyond, least, most))
         asked = vectors.T @ (self.prior * wrong)
         return np.asarray(self.prior * (vectors @ (number * asked / (1 + number * values))))
 

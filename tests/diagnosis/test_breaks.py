@@ -17,7 +17,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis import channels_of, find_stretches
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import open_stack
-from iscat_analysis.pipeline.summary import look_at
+from iscat_analysis.pipeline.finish import look_at
 from iscat_analysis.report.figures import movie_figure
 from iscat_analysis.schemas.course import LeftOut, Timeline
 from iscat_analysis.study import Movie

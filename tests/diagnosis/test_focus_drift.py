@@ -19,6 +19,7 @@ from iscat_analysis.diagnosis import Stretches
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.results import DetectionResult
+from iscat_analysis.fitting.run import Run
 from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.landing.find import analyse_landings
 
@@ -62,7 +63,7 @@ def _analysed(movie: InstrumentMovie, config: Config) -> DetectionResult:
     camera = camera_from_config(config.camera, SHAPE[1:], movie.dtype)
     jumps = [frame for frame, _ in config.optics.focus_jumps]
     return analyse_landings(
-        movie, config, camera, warn=lambda _: None, progress=lambda *_: None,
+        movie, config, camera, Run(),
         stretches=Stretches(((0, SHAPE[0]),)).with_jumps(jumps).kept,
     )  # fmt: skip
 

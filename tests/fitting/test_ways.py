@@ -21,7 +21,8 @@ from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.fitting.ranges import BackgroundMode, background_mode, describe_background_mode
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline import analyse, finder
+from iscat_analysis.pipeline import analyse
+from iscat_analysis.pipeline.kinds import kind_of
 from iscat_analysis.records import EVENT_COLUMNS, SEVERITY, Analysis, Status, Windows
 from iscat_analysis.study import Movie
 from iscat_analysis.tracking.moving_field import initial_background, load_field, tracking_context
@@ -70,7 +71,7 @@ def analyses(tmp_path_factory: pytest.TempPathFactory) -> dict[BackgroundMode, A
 
 def test_every_way_is_found() -> None:
     assert set(get_args(BackgroundMode)) == set(MOVIES)
-    assert len({finder(way) for way in MOVIES}) == len(MOVIES)
+    assert len({type(kind_of(_config(way))) for way in MOVIES}) == len(MOVIES)
     assert [background_mode(_config(way)) for way in MOVIES] == list(MOVIES)
 
 

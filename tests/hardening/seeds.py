@@ -26,10 +26,12 @@ from iscat_analysis.camera import read_map
 from iscat_analysis.config import Config, config_to_toml, load_config
 from iscat_analysis.day.table import read_table
 from iscat_analysis.executors import open_executor
+from iscat_analysis.fitting.run import packed
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.optics.measured import Template
 from iscat_analysis.reading import read_json, read_parquet
+from iscat_analysis.records import Clip, EventView
 
 Seed = dict[str, bytes]
 Reader = Callable[[Path], Any]
@@ -214,8 +216,10 @@ def _result() -> Seed:
 
 def _cache() -> Seed:
     out = io.BytesIO()
-    np.savez(out, traces=np.arange(9.0), clip_frames=np.arange(3))
-    return {"part.npz": out.getvalue(), "part.parquet": _parquet(_events())}
+    images = np.arange(36.0).reshape(3, 3, 4)
+    view = EventView(3, 1, 2, *images, clip=Clip((5,), 4, images[:1]))
+    np.savez(out, **packed((view, _events())))
+    return {"part.npz": out.getvalue()}
 
 
 # ---- readers -------------------------------------------------------------------------------------
@@ -239,8 +243,8 @@ def _kept_part(path: Path) -> None:
 
     part = object.__new__(Checkpoint)  # of any key
     part._folder, part.kept = path.parent, 0
-    part._paths = lambda _: (path.with_suffix(".parquet"), path.with_suffix(".npz"))
-    part.read(0)
+    part._path = lambda _: path
+    part.load(0)
 
 
 def _outside(path: Path) -> None:

@@ -270,7 +270,7 @@ def test_an_interrupt_keeps_finished_chunks_and_leaves_the_cluster_alive(
 def test_posteriors_are_those_of_one_process(cluster: Workers, landing: Path, monkeypatch) -> None:
     """How many are sampled in a chunk follows from those before it."""
     cluster.add(2)
-    monkeypatch.setattr("iscat_analysis.landing.find.POSTERIORS", 2)
+    monkeypatch.setattr("iscat_analysis.landing.chunks.POSTERIORS", 2)
     monkeypatch.chdir(landing.parent)  # workers run elsewhere
     more = {"posterior.enabled": True, "posterior.steps": 100, "posterior.walkers": 10}
     alone, apart = (

@@ -26,6 +26,7 @@ from uneven_movies import (
 
 from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import FIELD_TERMS, Config, load_config
+from iscat_analysis.fitting.run import Run
 from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.trust.uneven_reference import reference_map
@@ -97,7 +98,7 @@ def _learned(movie: UnevenMovie) -> tuple[Config, dict[str, tuple[float, float]]
 
 def _outcome(movie: UnevenMovie, config: Config, landings: Landings) -> _Outcome:
     camera = camera_from_config(config.camera, SHAPE[1:], movie.dtype)
-    found = analyse_landings(movie, config, camera, warn=lambda _: None, progress=lambda *_: None)
+    found = analyse_landings(movie, config, camera, Run())
     good = found.fits[found.fits["status"] == "ok"].reset_index(drop=True)
     learned = config.optics.covariance is not None
     shared = systematic(config, good)["mass_kda"] if learned else np.zeros(len(good))
@@ -160,7 +161,7 @@ def test_a_cone_of_light_is_fitted_with_where_it_is_configured(cone: float) -> N
 def test_what_is_said_of_the_reference_makes_masses_right(tilt: float) -> None:
     movie, landings, config = _movie(other_reference(0.0, tilt), 21), _landings(21), _config()
     camera = camera_from_config(config.camera, SHAPE[1:], movie.dtype)
-    found = analyse_landings(movie, config, camera, warn=lambda _: None, progress=lambda *_: None)
+    found = analyse_landings(movie, config, camera, Run())
     said = reference_map(config, found.fits)
     assert said is not None
     assert abs(said.terms[0] * SHAPE[1] / 2 / said.field_px[2] - tilt) < SIGMAS * said.errors[0]

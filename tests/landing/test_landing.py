@@ -16,23 +16,22 @@ import pytest
 import tifffile
 from scenes import Stack
 
-from iscat_analysis import pipeline as pipeline_module
 from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting import events as events_module
 from iscat_analysis.fitting.ranges import background_mode
-from iscat_analysis.fitting.run import partial_folder
+from iscat_analysis.fitting.run import Run, partial_folder
 from iscat_analysis.landing import chunks as chunk_work
 from iscat_analysis.landing import merging
-from iscat_analysis.landing.find import analyse_landings, frame_warnings
+from iscat_analysis.landing.find import analyse_landings, drift_findings
 from iscat_analysis.landing.merging import FinishedChunk, MergedChunks
 from iscat_analysis.landing.steps import ChunkFitter
 from iscat_analysis.landing.tasks import TaskBuilder
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline import analyse, fit_stack
-from iscat_analysis.pipeline.injection import inject_and_recover
-from iscat_analysis.pipeline.summary import summary_of
+from iscat_analysis.pipeline.finish import summary_of
+from iscat_analysis.pipeline.landings import Landing, inject_and_recover
 from iscat_analysis.records import EVENT_COLUMNS, FRAME_COLUMN, EventView
 from iscat_analysis.search import chunks as chunks_module
 from iscat_analysis.search import chunks as planning
@@ -76,6 +75,8 @@ def _config(*settings: str, **sections: Any) -> Config:
 class Memory(Stack):
     """A movie in memory that notes which frames are read."""
 
+    identity = "movie"
+
     def __init__(self, counts: np.ndarray) -> None:
         super().__init__(counts)
         self.reads: list[tuple[int, int]] = []
@@ -96,7 +97,7 @@ def _run(counts: np.ndarray, config: Config | None = None, **options: Any) -> tu
     told: list[str] = []
     result = analyse_landings(
         Memory(counts), config or _config(), options.pop("camera", Camera(gain_e_per_adu=4.0)),
-        warn=told.append, progress=options.pop("progress", lambda *_: None), **options,
+        Run(told.append, **options),
     )  # fmt: skip
     return result, told
 
@@ -171,9 +172,7 @@ def test_chunks_change_nothing_but_the_last_digits(
 ) -> None:
     config = _config("compute.memory_limit_mb=64")
     movie = Memory(np.tile(counts, (4, 1, 1)))
-    cut = analyse_landings(
-        movie, config, Camera(gain_e_per_adu=4.0), warn=lambda _: None, progress=lambda *_: None
-    )
+    cut = analyse_landings(movie, config, Camera(gain_e_per_adu=4.0), Run())
     assert cut.summary["chunks"] > 1
     spans = sorted(set(movie.reads))
     assert sum(b - a for a, b in spans) <= 4 * FRAMES + 2 * 400  # the noise curve reads again
@@ -355,7 +354,7 @@ def test_what_was_injected_is_looked_for_in_the_polarity_that_is_reported(
     camera = Camera(gain_e_per_adu=4.0)
     result, _ = _run(counts, config)
     found = inject_and_recover(
-        Memory(counts), config, camera, result, 3, progress=lambda *_: None
+        Memory(counts), config, camera, result, Run(inject=3)
     )  # fmt: skip
     assert found["added"] == 3
     assert found["recovered"] >= 2
@@ -372,7 +371,7 @@ def test_pulls_of_injected_particles_are_in_units_of_the_errors_that_are_reporte
         config = _config(f"fit.sigma={kind}")
         result, _ = _run(counts, config, camera=camera)
         found = inject_and_recover(
-            Memory(counts), config, camera, result, 8, progress=lambda *_: None
+            Memory(counts), config, camera, result, Run(inject=8)
         )  # fmt: skip
         pulls.append(found["pull_std"])
     assert pulls[0] > 1.1 * pulls[1]
@@ -468,7 +467,7 @@ def test_a_moving_pattern_is_named(shift: int, named: bool) -> None:
             ends_e=np.stack([image, np.roll(image, shift, axis=1)]),
         )
     )
-    said = frame_warnings("movie", merged, merged.drift(), np.ones(400), 0, 40)
+    said = [one.text for one in drift_findings("movie", merged, 10.0)]
     told = [text for text in said if "moved" in text]
     assert len(told) == named
     if named:
@@ -511,7 +510,7 @@ def test_windows_that_do_not_fit_into_memory() -> None:
     )
     config = _config("compute.memory_limit_mb=64", "background.window_frames=5")
     with pytest.raises(DataError, match=r"compute\.memory_limit_mb = "):
-        analyse_landings(large, config, Camera(), warn=lambda _: None, progress=lambda *_: None)
+        analyse_landings(large, config, Camera(), Run())
 
 
 @pytest.mark.parametrize(
@@ -523,7 +522,7 @@ def test_chunks_follow_one_another_and_fit_into_memory(frames: int, cores: list[
     config = _config("compute.memory_limit_mb=136", "background.window_frames=20")
     movie = Memory(np.zeros((frames, 256, 256), dtype="u2"))
     reader = chunks_module.reader_of(movie, config, Camera(), (0, frames))
-    plan = planning.plan_chunks(reader, config, 20, 5)
+    plan = planning.plan_chunks(reader, config, 20)
     edges = np.cumsum([0, *cores]).tolist()
     assert plan == [
         ((begin, end), (max(begin - 40, 0), min(end + 40, frames)))
@@ -593,7 +592,7 @@ def test_an_interrupted_run_resumes_to_the_same_result(
 ) -> None:
     config = _config("posterior.enabled=false", "background.window_frames=20", "compute.workers=1")
     monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.0031)
-    monkeypatch.setattr(pipeline_module, "FEW_FIGURES", 0)
+    monkeypatch.setattr(Landing, "event_figures", 0)
     fit_stack(movie, config, out=tmp_path / "whole.iscat")
     assert not partial_folder(tmp_path / "whole.iscat").exists()
     real: Callable[..., Any] = chunk_work.analyse_chunk
@@ -627,14 +626,14 @@ def test_an_interrupted_run_resumes_to_the_same_result(
 
 
 def test_chunks_of_another_configuration_are_not_used(tmp_path: Path) -> None:
-    from iscat_analysis.landing.chunks import Store
+    from iscat_analysis.landing.chunks import ChunkStore
 
     one, two = _config(), _config("optics.focus_nm=-250")
-    keys = {Store(tmp_path, c, "movie", (8, 8), (0, 9), Camera()).key for c in (one, two)}
-    keys.add(Store(tmp_path, one, "another", (8, 8), (0, 9), Camera()).key)
+    keys = {ChunkStore(tmp_path, c, "movie", (8, 8), (0, 9), Camera()).key for c in (one, two)}
+    keys.add(ChunkStore(tmp_path, one, "another", (8, 8), (0, 9), Camera()).key)
     assert len(keys) == 3
     faster = one.model_copy(update={"compute": one.compute.model_copy(update={"workers": 7})})
-    assert Store(tmp_path, faster, "movie", (8, 8), (0, 9), Camera()).key in keys
+    assert ChunkStore(tmp_path, faster, "movie", (8, 8), (0, 9), Camera()).key in keys
 
 
 # ---- drift -----------------------------------------------------------------------------------
@@ -778,7 +777,7 @@ def test_an_interrupted_injection_keeps_what_the_movie_gave(
     movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = _config("posterior.enabled=false")
-    monkeypatch.setattr(pipeline_module, "FEW_FIGURES", 0)
+    monkeypatch.setattr(Landing, "event_figures", 0)
     calls = _interrupted_at_the_second_chunk(monkeypatch)
     out = tmp_path / "cut.iscat"
     with pytest.raises(KeyboardInterrupt):
@@ -796,7 +795,7 @@ def test_an_interrupted_injection_keeps_what_the_movie_gave(
 def test_chunks_of_another_camera_map_are_not_used(counts: np.ndarray, tmp_path: Path) -> None:
     for gain in (4.0, 5.0):
         camera = Camera(gain_e_per_adu=np.full((SIDE, SIDE), gain))
-        result, _ = _run(counts, camera=camera, partial=tmp_path, identity="movie")
+        result, _ = _run(counts, camera=camera, partial=tmp_path)
         if gain == 4.0:
             first = result.fits["sigma_mass_kda"]
     assert (result.fits["sigma_mass_kda"] < first).all()
@@ -808,8 +807,8 @@ def test_a_corrected_run_resumes_to_the_same_result(
     monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.005)
     config = _config(CORRECTED, "compute.workers=1")
     calls = _interrupted_at_the_second_chunk(monkeypatch)
-    _run(drifting, config, partial=tmp_path, identity="movie")
-    resumed, _ = _run(drifting, config, partial=tmp_path, identity="movie")
+    _run(drifting, config, partial=tmp_path)
+    resumed, _ = _run(drifting, config, partial=tmp_path)
     assert len(calls) == 1 + cut.summary["chunks"]
     pd.testing.assert_frame_equal(resumed.fits, cut.fits)
     assert resumed.summary == cut.summary
@@ -821,7 +820,7 @@ def test_a_corrected_run_resumes_to_the_same_result(
 
 
 def test_injected_particles_drift_along(followed: tuple[Any, list[str]]) -> None:
-    from iscat_analysis.pipeline.injection import Injected, InjectedMovie
+    from iscat_analysis.pipeline.landings import Injected, InjectedMovie
 
     way = followed[0].trajectory
     y, x = np.indices((31, 31)) - 15.0

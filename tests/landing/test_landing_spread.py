@@ -15,6 +15,7 @@ from scipy.stats import poisson
 from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.fitting.context import make_context
+from iscat_analysis.fitting.run import Run
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.landing.find import analyse_landings
@@ -66,7 +67,7 @@ def _analyse(config: Config, seed: int) -> pd.DataFrame:
     counts = np.array(list(Movie(config, seed).frames()))
     return analyse_landings(
         Stack(counts), config, Camera(gain_e_per_adu=4.0),
-        warn=lambda _: None, progress=lambda *_: None,
+        Run(),
     ).fits  # fmt: skip
 
 
@@ -139,7 +140,7 @@ def _alarms_in(kind: str, movies: int) -> int:
         found += len(
             analyse_landings(
                 Stack(np.clip(counts, 0, 65535).astype(np.uint16)), config,
-                Camera(gain_e_per_adu=4.0), warn=lambda _: None, progress=lambda *_: None,
+                Camera(gain_e_per_adu=4.0), Run(),
             ).fits
         )  # fmt: skip
     return found

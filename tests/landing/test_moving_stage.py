@@ -14,6 +14,7 @@ from instruments import Instrument, InstrumentMovie, Landings, draw_landings
 
 from iscat_analysis.camera import camera_from_config, follow_pattern
 from iscat_analysis.config import Config, load_config
+from iscat_analysis.fitting.run import Run
 from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.landing.find import analyse_landings
 
@@ -64,7 +65,7 @@ def test_optics_are_learned_with_the_motion_divided_out() -> None:
     k = learned.optics.covariance.names.index("na")
     assert abs(learned.optics.na - NA) < SIGMAS * np.sqrt(learned.optics.covariance.matrix[k][k])
     camera = camera_from_config(learned.camera, SHAPE[1:], _movie().dtype)
-    found = analyse_landings(_movie(), learned, camera, warn=said.append, progress=lambda *_: None)
+    found = analyse_landings(_movie(), learned, camera, Run(notify=said.append))
     good = found.fits["status"] == "ok"
     assert good.sum() >= len(LANDINGS.frame) - 3
     assert good.sum() >= len(found.fits) - 4
@@ -75,7 +76,7 @@ def test_a_stage_that_shakes_is_named_with_what_to_do() -> None:
     assert learned.optics.calibrate == "auto"
     camera = camera_from_config(learned.camera, SHAPE[1:], _movie().dtype)
     said: list[str] = []
-    analyse_landings(_movie(), learned, camera, warn=said.append, progress=lambda *_: None)
+    analyse_landings(_movie(), learned, camera, Run(notify=said.append))
     (line,) = (text for text in said if "shakes" in text)
     assert "the gain is not the cause" in line
     assert "set background.drift_correction = true" in line

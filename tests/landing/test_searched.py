@@ -14,10 +14,11 @@ import pytest
 import iscat_analysis as ia
 from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, load_config
+from iscat_analysis.fitting.run import Run
 from iscat_analysis.instrument.uneven import is_plausible
 from iscat_analysis.landing import steps as steps_module
 from iscat_analysis.landing.find import analyse_landings
-from iscat_analysis.landing.maps import LEVELS, Searched, searched_warning
+from iscat_analysis.landing.maps import LEVELS, Searched
 from iscat_analysis.landing.measured_images import ring_average
 from iscat_analysis.species import Efficiency
 from iscat_analysis.study import Movie
@@ -89,7 +90,7 @@ def _analysed(counts: np.ndarray) -> tuple[Any, list[str]]:
     told: list[str] = []
     result = analyse_landings(
         _Memory(counts), _config(vesicle=True), Camera(gain_e_per_adu=4.0),
-        warn=told.append, progress=lambda *_: None,
+        Run(notify=told.append),
     )  # fmt: skip
     return result, told
 
@@ -174,8 +175,6 @@ def test_shares_are_read_at_the_size_of_the_particles() -> None:
     assert small["searched_share"] == pytest.approx(0.75)
     assert small["partly_searched"] == [[15, 35, 0.5]]
     assert large["searched_share"] == pytest.approx(1.0)
-    assert "75%" in searched_warning("movie", small)
-    assert searched_warning("movie", large) == ""
 
 
 def test_numbers_and_rates_are_for_all_of_field_and_time(tmp_path: Path) -> None:

@@ -17,9 +17,10 @@ from scenes import Stack
 from iscat_analysis.camera import Camera, measure_spectrum
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import DataError
+from iscat_analysis.fitting.run import Run
+from iscat_analysis.inference.nuisances import NOTHING
 from iscat_analysis.landing import chunks as chunk_work
 from iscat_analysis.landing import merging, neighbours, steps
-from iscat_analysis.landing import merging as joining
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.movie import open_stack
 from iscat_analysis.records import FRAME_COLUMN
@@ -68,8 +69,7 @@ def counts() -> np.ndarray:
 
 def _run(movie: Any, config: Config | None = None, **options: Any) -> Any:
     return analyse_landings(
-        movie, config or _config(), Camera(gain_e_per_adu=4.0), warn=lambda _: None,
-        progress=lambda *_: None, **options,
+        movie, config or _config(), Camera(gain_e_per_adu=4.0), Run(), **options,
     )  # fmt: skip
 
 
@@ -244,10 +244,19 @@ def test_a_particle_on_a_seam_is_reported_once() -> None:
             "y_nm": 1.0, "x_nm": 1.0}  # fmt: skip
     for left, right in ((49.3, 49.6), (49.6, 49.3), (49.7, 49.8)):
         tables = [pd.DataFrame([rows | {"x_px": x}]) for x in (left, right)]
-        parts = [SimpleNamespace(lines=table) for table in tables]
-        assert len(joining._own_rows(tiles, parts)) == 1
+        assert len(merging.joined(tiles, [_finished(table) for table in tables]).lines) == 1
     apart = [pd.DataFrame([rows | {"x_px": x}]) for x in (47.0, 50.2)]
-    assert len(joining._own_rows(tiles, [SimpleNamespace(lines=one) for one in apart])) == 2
+    assert len(merging.joined(tiles, [_finished(table) for table in apart]).lines) == 2
+
+
+def _finished(lines: pd.DataFrame) -> merging.FinishedChunk:
+    """Make the results of half of a field that found one step."""
+    none = np.zeros((100, 50), dtype=bool)
+    return merging.FinishedChunk(
+        core=(0, 100), lines=lines, repeats=np.zeros((1, 4)), evidence=np.zeros((1, len(NOTHING))),
+        views=(), good=np.ones(100, dtype=bool), light=np.ones(100), masked=none, saturated=none,
+        strongest=np.zeros((2, 100, 50)), ends_e=np.empty(0),
+    )  # fmt: skip
 
 
 def test_noise_and_optics_of_a_tile_are_those_of_its_place() -> None:
@@ -272,11 +281,11 @@ def test_the_division_of_a_field_minds_memory_and_halos() -> None:
     reader = SimpleNamespace(
         shape=(1200, 1920), frame_bytes=1200 * 1920 * 2, first=0, last=10_000, name="movie"
     )
-    (high, wide), core = _chosen(reader, config, 100, 25)
+    (high, wide), core = _chosen(reader, config, 100)
     halo = planning.halo_px(config)
     tiles = cut_field(reader.shape, (high, wide), halo)
     largest = max(tile.shape[0] * tile.shape[1] for tile in tiles)
-    blocks = (core + 2 * planning.halo_frames(100, 25)) / 25
+    blocks = (core + 2 * planning.halo_frames(100)) / 25
     assert largest * blocks * 4 < 0.2016 * 1000e6  # of sums, whose place the maps take
     seen = np.zeros(reader.shape, dtype=int)
     for tile in tiles:
@@ -284,20 +293,20 @@ def test_the_division_of_a_field_minds_memory_and_halos() -> None:
     assert (seen == 1).all()  # each pixel has one home
     work = sum(tile.shape[0] * tile.shape[1] for tile in tiles) * (core + 400) / core
     assert work < 2.6 * seen.size
-    (high, wide), core = _chosen(reader, config, 100, 25, in_place=False)
+    (high, wide), core = _chosen(reader, config, 100, in_place=False)
     tiles = cut_field(reader.shape, (high, wide), halo)
     largest = max(tile.shape[0] * tile.shape[1] for tile in tiles)
     assert largest * (core + 400) / 25 * 8 < 0.2016 * 1000e6  # of sums and maps
     small = load_config(None, ["camera.pixel_size_nm=84.0", "compute.memory_limit_mb=64"])
     with pytest.raises(DataError, match=r"compute\.memory_limit_mb = "):
-        _chosen(reader, small, 100, 25)
+        _chosen(reader, small, 100)
     longer = load_config(None, ["camera.pixel_size_nm=84.0", "compute.memory_limit_mb=64000"])
     with pytest.raises(DataError, match=r"6 GB hold 1302 of 1920 x 1200 pixels: lower"):
-        _chosen(reader, longer, 400, 100)  # no memory is enough
-    _chosen(reader, longer, 150, 37)  # control
+        _chosen(reader, longer, 400)  # no memory is enough
+    _chosen(reader, longer, 150)  # control
 
 
 def _chosen(
-    reader: Any, config: Config, window: int, stride: int, *, in_place: bool = True
+    reader: Any, config: Config, window: int, *, in_place: bool = True
 ) -> tuple[tuple[int, int], int]:
-    return planning.choose_tiles(reader, config, window, stride, 10_000, in_place=in_place)
+    return planning.choose_tiles(reader, config, window, 10_000, in_place=in_place)

@@ -11,7 +11,8 @@ import pytest
 
 import iscat_analysis as ia
 from iscat_analysis.bounds import power_searched
-from iscat_analysis.pipeline import analyse, injection
+from iscat_analysis.pipeline import analyse
+from iscat_analysis.pipeline import landings as injection
 
 ADDED = 20
 SIGMAS = 4.0

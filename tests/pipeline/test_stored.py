@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 import iscat_analysis as ia
 from iscat_analysis.camera import CutFrames
 from iscat_analysis.movie import Stack
-from iscat_analysis.pipeline import redraw as redraw_module
+from iscat_analysis.pipeline import landings as redraw_module
 
 pytestmark = pytest.mark.usefixtures("all_sketched")
 

@@ -65,9 +65,10 @@ def loaded(movie, config, tmp_path_factory) -> list[set[str]]:
     setup = tmp_path_factory.mktemp("loaded") / "setup.toml"
     setup.write_text(ia.config_to_toml(config), encoding="utf-8")
     code = (
-        "import sys, iscat_analysis as ia; from iscat_analysis.pipeline import finder; "
-        "finder('fixed'); print(*sys.modules); "
-        "finder('sliding'), finder('tracks'); print(*sys.modules); "
+        "import sys, iscat_analysis as ia; from iscat_analysis.pipeline.kinds import kind_of; "
+        "of = lambda settings: kind_of(ia.configure(None, settings=settings)); "
+        "of(['background.method=fixed']); print(*sys.modules); "
+        "of(['background.method=sliding']), of(['fit.mode=track']); print(*sys.modules); "
         f"ia.fit_movie({str(movie)!r}, config={str(setup)!r}).view(0); print(*sys.modules)"
     )
     return [set(line.split()) for line in _in_a_new_process(code).splitlines()]

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from report_factory import make_analysis, with_traces
 
-from iscat_analysis.fitting.run import packed_views, unpacked_views
+from iscat_analysis.fitting.run import packed, unpacked
 from iscat_analysis.records import Clip, EventView, Trace
 from iscat_analysis.report.event_figures import (
     CLIP_MS,
@@ -101,9 +101,9 @@ def test_a_clip_is_a_small_film() -> None:
 def test_views_survive_the_disk_with_and_without_a_trace() -> None:
     views = with_traces(make_analysis(4)).views
     views = (views[0], replace(views[1], trace=None, clip=None), *views[2:])
-    again = unpacked_views(packed_views(views))
-    for number, (one, two) in enumerate(zip(views, again, strict=True)):
-        assert two.event == number
+    again = unpacked(packed(views), (EventView, Trace, Clip))
+    for one, two in zip(views, again, strict=True):
+        assert one.event == two.event
         for what in ("contrast", "model", "residual"):
             np.testing.assert_array_equal(getattr(one, what), getattr(two, what))
         if one.trace is None or one.clip is None:
@@ -116,7 +116,7 @@ def test_views_survive_the_disk_with_and_without_a_trace() -> None:
         nothing = np.empty(0)
         for left, right in ((one.trace, two.trace), (one.clip, two.clip)):
             assert repr(replace(left, contrast=nothing)) == repr(replace(right, contrast=nothing))
-    assert unpacked_views(packed_views(())) == ()
+    assert unpacked(packed(()), ()) == ()
 
 
 def test_the_page_holds_trace_and_clip_and_a_figure_the_trace() -> None:

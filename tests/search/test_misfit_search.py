@@ -15,6 +15,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.fitting.results import DetectionResult
+from iscat_analysis.fitting.run import Run
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.search.peaks import EXCEEDS, Described, chi2_excess, size_on_ring
 
@@ -55,7 +56,7 @@ def _analysed(instrument: Instrument, gain: float = 4.0) -> tuple[DetectionResul
     config = _configured("background.method=sliding", gain=gain)
     said: list[str] = []
     camera = camera_from_config(config.camera, (SHAPE[1], SHAPE[2]), movie.dtype)
-    result = analyse_landings(movie, config, camera, warn=said.append, progress=lambda *_: None)
+    result = analyse_landings(movie, config, camera, Run(notify=said.append))
     return result, said
 
 

@@ -10,7 +10,7 @@ import pytest
 from markupsafe import Markup
 
 import iscat_analysis as ia
-from iscat_analysis.pipeline.summary import sizes_of_tracks
+from iscat_analysis.pipeline.finish import sizes_of_tracks
 from iscat_analysis.records import FloatArray
 from iscat_analysis.report.species import sizes_figure, sizes_section
 from iscat_analysis.species.diameters import describe_sizes

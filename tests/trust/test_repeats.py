@@ -28,7 +28,7 @@ from iscat_analysis.inference.split_frames import (
 )
 from iscat_analysis.landing.split_frames import most_windows
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.pipeline.summary import species_of
+from iscat_analysis.pipeline.finish import species_of
 from iscat_analysis.records import FREE_PARAMETERS, Candidate
 from iscat_analysis.report import render_report
 from iscat_analysis.report.answer import headline, rejection, species_widths

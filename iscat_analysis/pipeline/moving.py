@@ -1,0 +1,273 @@
+"""Movies of particles that move, followed from frame to frame over three kinds of background."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from iscat_analysis.camera import add_frames
+from iscat_analysis.diagnosis import Noise, Prepared, judge_beside
+from iscat_analysis.findings import remark
+from iscat_analysis.fitting.context import AnalysisContext
+from iscat_analysis.fitting.events import Region
+from iscat_analysis.fitting.field import add_signal
+from iscat_analysis.fitting.ranges import checked, fitted_frames
+from iscat_analysis.fitting.results import DetectionResult
+from iscat_analysis.fitting.run import Run
+from iscat_analysis.pipeline.before_after import Background, BeforeAfter, StoredEvents
+from iscat_analysis.pipeline.kinds import Kind, Look, Redraw, candidate_table, with_threshold
+from iscat_analysis.records import EventView, FloatArray, Windows, silent
+from iscat_analysis.threads import threads
+from iscat_analysis.tracking.block_store import row_view
+from iscat_analysis.tracking.dark_field import beside_particles
+from iscat_analysis.tracking.find import find_moving, track_frames
+from iscat_analysis.tracking.joint.likelihood import MovingField
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
+from iscat_analysis.tracking.moving import blurred_rows
+from iscat_analysis.tracking.moving_field import (
+    LEAST_FRAMES,
+    exposure_of,
+    initial_background,
+    load_field,
+    restore_particle_light,
+    search_frames,
+    tracking_context,
+)
+
+AROUND = 100
+"""Frames that make the background of one frame in which particles move."""
+
+_BACKGROUND_TURNS = 3  # of level and power of a background under particles that are known
+
+
+class FrameByFrame(BeforeAfter):
+    """Particles that move over a background that was recorded before, or is known."""
+
+    still = False
+
+    def fitted(
+        self, ready: Prepared, run: Run, ground: Background, pool: ThreadPoolExecutor
+    ) -> DetectionResult:
+        """Fit each frame by itself, and link the fits; see `BeforeAfter`."""
+        movie, camera, windows = ready.steady, ready.camera, ground.windows
+        texts: list[str] = []
+        found = track_frames(
+            ground.context, movie, camera, windows, ground.summary,
+            check=checked(movie, camera), pool=pool, progress=run.progress,
+            doubt=ground.doubt, warn=texts.append,
+        )  # fmt: skip
+        run.report(*map(remark, texts))
+        if not windows.n_before:
+            noise = _judge_beside_particles(ready, ground.context, windows, found.fits)
+            run.report(*noise.findings)
+        return found
+
+
+class MovingInDarkField(FrameByFrame):
+    """Particles that move, and add their light to a background that is learnt with them."""
+
+    keeps_parts = True
+
+    def find(self, ready: Prepared, run: Run) -> DetectionResult:
+        """Learn the background in turns; see `Kind`."""
+        return find_moving(ready, run)
+
+    def redraw(
+        self,
+        ready: Prepared,
+        table: pd.DataFrame,
+        tracks: pd.DataFrame | None,
+        summary: Mapping[str, Any],
+    ) -> Redraw:
+        """Draw rows over the light beside the particles; see `Kind`."""
+        del tracks, summary
+        return _StoredInDarkField(self, ready, table).draw
+
+
+class _StoredInDarkField(StoredEvents):
+    """Draws rows over a background that is learnt with the tracks."""
+
+    def made_context(self) -> AnalysisContext:
+        """Make the models; see `StoredEvents`."""
+        ready, frames = self._ready, self.after[1] - self.after[0]
+        return tracking_context(ready.config, ready.shape, frames, ready.lines)
+
+    def sums(self, span: tuple[int, int]) -> Windows:
+        """Sum some frames over the light beside the particles; see `StoredEvents`."""
+        ready = self._ready
+        return add_frames(self._ground, ready.camera, ready.steady.read(*span), span[0])
+
+    @cached_property
+    def _ground(self) -> Windows:
+        sums = super().sums(self.after)
+        return replace(sums, before_e=beside_particles(self.context, sums, self.table))
+
+
+class Moving(Kind):
+    """Particles that move over a background that is learnt with them."""
+
+    heading = "blocks"
+
+    def find(self, ready: Prepared, run: Run) -> DetectionResult:
+        """Follow particles block by block; see `Kind`."""
+        return find_moving(ready, run)
+
+    def preview(self, ready: Prepared) -> MovingSearch:
+        """Search single frames; see `Kind`."""
+        return MovingSearch(ready)
+
+    def redraw(
+        self,
+        ready: Prepared,
+        table: pd.DataFrame,
+        tracks: pd.DataFrame | None,
+        summary: Mapping[str, Any],
+    ) -> Redraw:
+        """Draw particles in single frames, over the background of their block; see `Kind`."""
+        blocks = int(summary[self.heading]["number"])
+        return StoredTracks(ready, table, tracks, blocks).draw
+
+
+class MovingSearch:
+    """Searches single frames for particles that are not in the median of the frames around."""
+
+    def __init__(self, ready: Prepared) -> None:
+        movie, config, camera = ready.steady, ready.config, ready.camera
+        self._config, check = config, checked(movie, camera)
+        self.frames = first, last = fitted_frames(movie, config)
+        self.longest = last - first
+        self.window = min(AROUND, self.longest)
+        self._context = tracking_context(config, ready.shape, max(last - first, 1), ready.lines)
+
+        @lru_cache(1)
+        def background(span: tuple[int, int]) -> tuple[MovingField, BackgroundEstimate]:
+            with threads(config.compute.workers) as pool:
+                field = load_field(self._context, movie, camera, span, check, pool, silent)
+                return field, initial_background(config, field)
+
+        self._background = background
+
+    def context(self, window: int) -> AnalysisContext:  # noqa: ARG002
+        """Give models and threshold, which are those of every window."""
+        return self._context
+
+    def look(self, frame: int, window: int) -> Look:
+        """Compare one frame with the median of those around it."""
+        first, last = self.frames
+        window = max(window, min(LEAST_FRAMES, last - first))
+        frame = min(max(frame, first), last - 1)
+        start = min(frame - (frame - first) % window, last - window)
+        span = start, start + window
+        field, ground = self._background(span)
+        nothing = np.zeros(0, dtype=np.int64)
+        rows = Localizations.of(nothing, nothing, np.zeros((0, 5)))
+        here, context = frame - start, self._context
+        light = ground.level * ground.power[here]
+        image = field.residual(ground, rows, here, here + 1)[0] / light
+
+        def search(threshold: float) -> pd.DataFrame:
+            with threads(self._config.compute.workers) as pool:
+                found = search_frames(
+                    with_threshold(context, threshold), field, ground, rows,
+                    pool=pool, frames=(here, here + 1),
+                )  # fmt: skip
+            mass = np.asarray(context.model.scale.mass(found.strength))
+            each = zip(found.x_px, found.y_px, found.snr, found.z_nm, mass, strict=True)
+            return candidate_table(
+                (x, y, snr, context.model.peak_contrast(float(z), float(m)), m)
+                for x, y, snr, z, m in each
+            )
+
+        return Look(
+            frame, span, (frame, frame + 1), np.where(field.used, image, np.nan),
+            context.templates.threshold, search,
+        )  # fmt: skip
+
+
+class StoredTracks:
+    """Draws particles in single frames, over the background of their block."""
+
+    def __init__(
+        self, ready: Prepared, table: pd.DataFrame, tracks: pd.DataFrame | None, blocks: int
+    ) -> None:
+        self._ready, self._table = ready, table
+        first, last = fitted_frames(ready.steady, ready.config)
+        frames = max(last - first, 1)
+        self._context = tracking_context(ready.config, ready.shape, frames, ready.lines)
+        self._edges = [first + (last - first) * k // blocks for k in range(blocks + 1)]
+        self._known = table["mass_kda"].notna() & table["track"].notna()
+        self._diffusion: dict[int, float] = {}
+        if tracks is not None:
+            found = np.nan_to_num(tracks["d_um2_s"].to_numpy(float))
+            self._diffusion = dict(zip(tracks["track"].astype(int), found.tolist(), strict=True))
+        self._opened = lru_cache(1)(self._open)
+
+    def _open(
+        self, start: int, stop: int
+    ) -> tuple[MovingField, BackgroundEstimate, Localizations, NDArray[np.int64]]:
+        """Read a block, and fit its background under the particles."""
+        ready, context = self._ready, self._context
+        movie, config, camera = ready.steady, ready.config, ready.camera
+        inside = np.flatnonzero(self._known & self._table["frame"].between(start, stop - 1))
+        part = self._table.iloc[inside]
+        theta = np.zeros((len(part), 5))
+        theta[:, :3] = part[["x_nm", "y_nm", "z_nm"]].to_numpy(float)
+        theta[:, 3] = context.model.scale.amplitudes(part["mass_kda"].to_numpy(float))
+        numbers, track = np.unique(part["track"].to_numpy(int), return_inverse=True)
+        frame = part["frame"].to_numpy(np.int64) - start
+        order = np.lexsort((track, frame))
+        rows = Localizations.of(frame, track.astype(np.int64), theta)
+        speeds = np.array([self._diffusion.get(int(n), 0.0) for n in numbers]).reshape(-1, 1)
+        rows, variances = blurred_rows(rows, speeds, exposure_of(config)[1])
+        with threads(config.compute.workers) as pool:
+            check = checked(movie, camera)
+            field = load_field(context, movie, camera, (start, stop), check, pool, silent)
+            field.set_blurs(variances)
+            follows = config.background.power_normalization
+            ground = initial_background(config, field)
+            restore_particle_light(context, field, movie, camera, start, ground, rows)
+            for _ in range(_BACKGROUND_TURNS):
+                found = field.fit(ground, rows, sweeps=0)[1]
+                learnt = config.background.learnt_with_tracks
+                level = found.level if learnt else ground.level
+                ground = BackgroundEstimate(level, found.power if follows else ground.power)
+        return field, ground, rows, inside[order]
+
+    def draw(self, row: int) -> EventView:
+        """Draw a row of the table."""
+        frame = int(self._table["frame"].iloc[row])
+        k = int(np.searchsorted(self._edges, frame, side="right")) - 1
+        field, ground, rows, where = self._opened(self._edges[k], self._edges[k + 1])
+        return row_view(field, ground, rows, int(np.flatnonzero(where == row)[0]))
+
+
+def _judge_beside_particles(
+    ready: Prepared, context: AnalysisContext, windows: Windows, table: pd.DataFrame
+) -> Noise:
+    """Judge the camera in pixels that no moving particle comes near; the background is known."""
+    movie, camera, (first, last) = ready.steady, ready.camera, windows.frames_after
+    frame = table["frame"].to_numpy(np.int64)
+    particles = table[["x_nm", "y_nm", "z_nm", "mass_kda"]].to_numpy(float)
+    rows, columns = ready.shape
+    field = Region((0, rows), (0, columns))
+
+    def without(count: int) -> FloatArray:
+        electrons = camera.to_electrons(movie.read(first, first + count))
+        for number, image in enumerate(electrons if not context.additive else ()):
+            signal = np.zeros(field.shape)
+            for x, y, z, mass in particles[frame == first + number].tolist():
+                add_signal(context, (x, y, z, mass), field, signal)
+            image /= 1 + signal
+        return electrons
+
+    noise = judge_beside(
+        context, movie, camera, (first, last), (frame, particles[:, :2]), ~windows.masked, without
+    )
+    return noise.compared_with_fits(table["chi2_reduced"].to_numpy(float))
