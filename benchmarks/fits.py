@@ -28,9 +28,14 @@ import numpy as np  # noqa: E402  # after the thread counts
 from _peer import peer_python  # noqa: E402
 
 from iscat_analysis.config import parse_config  # noqa: E402
-from iscat_analysis.inference.fit import fit_particle, search_box, start_theta  # noqa: E402
+from iscat_analysis.inference.fit import (  # noqa: E402  # noqa: E402
+    compile_kernels,
+    fit_particle,
+    parts_of,
+    search_box,
+    start_theta,
+)
 from iscat_analysis.inference.likelihood import Likelihood  # noqa: E402
-from iscat_analysis.inference.noise import compile_kernels, parts_of  # noqa: E402
 from iscat_analysis.records import Box, Candidate, FloatArray  # noqa: E402
 from iscat_analysis.study import Setting, make_setting, trial_generator  # noqa: E402
 

@@ -124,7 +124,7 @@ import json, sys, time
 import numpy as np
 try:
     from iscat_analysis.optics.forward import PixelGrid, forward_model
-    from iscat_analysis.inference.noise import asimov_conditional
+    from iscat_analysis.inference.counts import asimov_conditional
 except ImportError:
     from iscat_analysis.forward import PixelGrid, forward_model
     from iscat_analysis.likelihood import asimov_conditional

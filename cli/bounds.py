@@ -247,7 +247,7 @@ def _optics(
     messages: Messages, config: Config, events: int | None, free: str | None, output: Output
 ) -> None:
     """Print how well particles would tell the microscope."""
-    from iscat_analysis.bounds.optics_forecast import EVENTS, forecast_optics
+    from iscat_analysis.bounds.shared import EVENTS, forecast_optics
     from iscat_analysis.report.bounds import OPTICS_BOUNDS_FILES, write_optics_bounds
     from iscat_analysis.report.output import check_output
 

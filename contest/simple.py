@@ -15,11 +15,9 @@ from scipy.optimize import least_squares
 from scipy.signal import fftconvolve
 
 from iscat_analysis.config import Optics
-from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.noise import compile_kernels, parts_of
+from iscat_analysis.inference.fit import compile_kernels, fit_particle, parts_of
 from iscat_analysis.pieces import psf
-from iscat_analysis.pieces.counts import gather
-from iscat_analysis.pieces.setups import config_of
+from iscat_analysis.pieces.counts import config_of, gather
 from iscat_analysis.records import PARAMETERS, Candidate, FloatArray, Status
 from iscat_analysis.study import EstimatorSetup
 

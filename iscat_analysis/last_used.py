@@ -1,11 +1,15 @@
-"""Arrays that were used last, as many as have room: what is used again soon is not made again."""
+"""Arrays that were used last, as many as have room: what is used again soon is not made again.
+
+A cache for results that take long to compute and are needed again.
+"""
 
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
+from functools import lru_cache
 from threading import Lock
-from typing import Generic, TypeVar
+from typing import Generic, TypeVar, TypeVarTuple
 
 V = TypeVar("V")
 
@@ -34,3 +38,28 @@ class LastUsed(Generic[V]):
             self._held[key] = value, size_bytes
             while self._bytes > self._room_bytes and len(self._held) > 1:
                 self._bytes -= self._held.popitem(last=False)[1][1]
+
+
+Key = TypeVarTuple("Key")
+T = TypeVar("T")
+
+
+def memoize(size: int, make: Callable[[*Key], T]) -> Callable[[*Key], T]:
+    """Keep the last few results of a function.
+
+    If several threads need the same result at the same time, one computes it and the others wait;
+    with `functools.lru_cache` each would compute it.
+    """
+
+    @lru_cache(size)
+    def place(*_: Hashable) -> tuple[Lock, list[T]]:
+        return Lock(), []
+
+    def get(*key: *Key) -> T:
+        lock, found = place(*key)
+        with lock:
+            if not found:
+                found.append(make(*key))
+        return found[0]
+
+    return get

@@ -14,8 +14,8 @@ import pandas as pd
 
 from iscat_analysis.answers.calibrations import optics_calibration
 from iscat_analysis.bounds import bounds_report
-from iscat_analysis.bounds.optics_forecast import EVENTS, OpticsForecast
-from iscat_analysis.bounds.optics_forecast import forecast_optics as _forecast
+from iscat_analysis.bounds.shared import EVENTS, OpticsForecast
+from iscat_analysis.bounds.shared import forecast_optics as _forecast
 from iscat_analysis.config import LARGEST_NM, Config, configure
 from iscat_analysis.executors import THREADS, open_executor
 from iscat_analysis.inference.checks import number_in, path_in, truth_in

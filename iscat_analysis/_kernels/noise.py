@@ -12,8 +12,8 @@ POISSON      (d, α, β, v): λ = e^g (α + β s) + v, ℓ = d ln λ − λ; v i
 ℓ is relative to its value without a particle.  A masked pixel has all four entries zero, and the
 third is above zero in every other pixel.
 
-A new noise model needs a number, and a branch in each of these functions.  The other kernels pass
-the number on; `iscat_analysis.inference.noise_models` defines it.
+A new noise law needs a number, and a branch in each of these functions.  The other kernels pass
+the number on; `iscat_analysis.inference.laws` defines it, and takes its formulas from here.
 """
 
 from __future__ import annotations
@@ -112,6 +112,16 @@ def score_of_pixel(
         bend = gain * gain * per
         bright = expected / max(gain, FLOOR)
     return pull, bend, bright
+
+
+@kernel()
+def score_of_pixels(
+    kind: int, data: FloatArray, level: float, s: FloatArray, out: FloatArray
+) -> None:
+    """Fill out (3, n) with what `score_of_pixel` gives of the pixels of data (4, n)."""
+    for j in range(s.size):
+        c0, c1, c2, c3 = data[0, j], data[1, j], data[2, j], data[3, j]
+        out[0, j], out[1, j], out[2, j] = score_of_pixel(kind, c0, c1, c2, c3, level, s[j])
 
 
 @kernel(fastmath=FAST)
@@ -232,7 +242,7 @@ def tail_of_pixel(
 ) -> tuple[bool, float, float, float]:
     """Give the arguments of the exact tail probability beyond a count, and whether there is one.
 
-    `NoiseModel.tails` computes the probability.
+    `NoiseLaw.tails` computes the probability.
     """
     if kind == CONDITIONAL:
         # read noise reduces the counts by its share of the variance, as if they were lost

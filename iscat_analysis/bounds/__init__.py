@@ -38,25 +38,29 @@ from iscat_analysis.bounds.holevo import (
 )
 from iscat_analysis.bounds.paper import Reproduction, reproduce
 from iscat_analysis.bounds.planning import (
+    AXES,
+    Axis,
     Best,
     Cost,
     Effort,
     Goal,
+    Scan,
     budget,
+    changed,
     effort,
     optimize,
     parse_names,
+    parse_scan,
     parse_target,
+    scan,
 )
-from iscat_analysis.bounds.pupil import PupilOptimum, optimize_pupil
-from iscat_analysis.bounds.pupil_search import KNOBS
+from iscat_analysis.bounds.pupil import KNOBS, PupilOptimum, optimize_pupil
 from iscat_analysis.bounds.quantum import (
     incompatible_pairs,
     quantum_bounds,
     quantum_information,
     z_nm_phase_free,
 )
-from iscat_analysis.bounds.scan import AXES, Axis, Scan, changed, parse_scan, scan
 from iscat_analysis.bounds.shared import (
     displacement,
     eliminated,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.inference.likelihood import LEVEL, Likelihood
+from iscat_analysis.inference.likelihood import Likelihood, ModelLikelihood
 from iscat_analysis.records import PARAMETERS
 
 FloatArray = NDArray[np.float64]
@@ -63,38 +63,42 @@ class EventBounds:
 
 
 def event_bounds(
-    likelihood: Likelihood,
+    likelihood: ModelLikelihood,
     theta: FloatArray,
     free: tuple[str, ...],
-    collected: float,
+    collected: float = math.nan,
     *,
     quantum: ComplexArray | None = None,
     level: bool = False,
 ) -> EventBounds:
-    """Classical and quantum bounds of one particle.
+    """Classical and quantum bounds of one particle, of any model, in the order of its parameters.
 
-    Shapes: `theta` (5,), `quantum` (4, 4).
+    Quantum bounds are NaN where `collected` is, the scattered photons.
+
+    Shapes: `theta` (p,), `quantum` (4, 4).
     """
-    unknown = [name for name in free if name not in PARAMETERS]
+    parameters = likelihood.model.parameters
+    names, count = tuple(each.name for each in parameters), len(parameters)
+    unknown = [name for name in free if name not in names]
     if unknown or not free:
-        raise ConfigError(f"free = {list(free)}: choose one or more of {', '.join(PARAMETERS)}")
-    model = likelihood.model
-    if model.is_measured or math.isnan(collected):  # nothing is known of the light itself
-        quantum, collected = np.zeros((4, 4), dtype=complex), 0.0
-    if quantum is None:
-        height = max(theta[2], 0.0)  # a nuisance may be below
-        quantum = quantum_information(model, height, amplitude=float(theta[3]))
-    slope = abs(model.scale.slope(theta[3]))
-    relative = abs(theta[3]) * slope  # mass for a relative step of 1 [kDa]
-    to_kda = np.array([1.0, 1.0, 1.0, 1 / slope])
+        raise ConfigError(f"free = {list(free)}: choose one or more of {', '.join(names)}")
+    slopes = [each.slope(float(value)) for each, value in zip(parameters, theta, strict=False)]
     whole = likelihood.score_fisher(theta)[2]
-    if level and whole[LEVEL, LEVEL] > 0:  # what is left once the level is fitted: Schur complement
-        whole = whole - np.outer(whole[:, LEVEL], whole[LEVEL]) / whole[LEVEL, LEVEL]
-    fisher = whole[:4, :4] * np.outer(to_kda, to_kda)
-    per_kda = np.array([1.0, 1.0, 1.0, 1 / relative]) if relative else np.array([1.0] * 3 + [0.0])
-    light = collected * quantum.real * np.outer(per_kda, per_kda)
-    light[2, 2] += likelihood.height_prior[1]  # as the Fisher matrix has it
-    return bounds_from_matrices(fisher, light, free)
+    if level and whole[-1, -1] > 0:  # what is left once the level is fitted: Schur complement
+        whole = whole - np.outer(whole[:, -1], whole[-1]) / whole[-1, -1]
+    fisher = whole[:count, :count] / np.outer(slopes, slopes)
+    light = np.zeros_like(fisher)
+    if isinstance(likelihood, Likelihood):
+        model = likelihood.model
+        if not (model.is_measured or math.isnan(collected)):
+            if quantum is None:
+                height = max(theta[2], 0.0)  # a nuisance may be below
+                quantum = quantum_information(model, height, amplitude=float(theta[3]))
+            relative = abs(theta[3] * slopes[3])  # mass for a relative step of 1 [kDa]
+            per_kda = np.array([1.0, 1.0, 1.0, 1 / relative if relative else 0.0])
+            light = collected * quantum.real * np.outer(per_kda, per_kda)
+        light[2, 2] += likelihood.height_prior[1]  # as the Fisher matrix has it
+    return bounds_from_matrices(fisher, light, free, names)
 
 
 def bounds_from_matrices(

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from iscat_analysis.bounds.classical import EventBounds, bounds_from_matrices, event_bounds
 from iscat_analysis.bounds.holevo import natural_bound
-from iscat_analysis.bounds.orientation import ROD_PARAMETERS, rod_bounds
 from iscat_analysis.bounds.quantum import (
     NAMES,
     incompatible_pairs,
@@ -22,12 +21,12 @@ from iscat_analysis.bounds.quantum import (
 )
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise import asimov_conditional, asimov_poisson
-from iscat_analysis.inference.orientation import rod_in
-from iscat_analysis.optics.collected import collected_area_nm2, photons_per_intensity
+from iscat_analysis.inference.counts import asimov_conditional, asimov_poisson
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood
+from iscat_analysis.inference.models import TurningRod
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
-from iscat_analysis.optics.rods import ANGLES, Rod
+from iscat_analysis.optics.model import collected_area_nm2, photons_per_intensity
+from iscat_analysis.optics.scatterers import ANGLES, Rod
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
 
 FloatArray = NDArray[np.float64]
@@ -215,7 +214,7 @@ def report_of(experiment: Experiment) -> dict[str, Any]:
         alone = z_nm_phase_free(model, z_nm)
         per_photon["qcrb"]["z_nm_phase_free"] = alone
         actual["qcrb"]["z_nm_phase_free"] = alone / root_light
-    optics, rod = config.optics, rod_in(model)
+    optics, rod = config.optics, model.aperture.scatterer
     return {
         "at": {
             "scheme": optics.scheme,
@@ -253,15 +252,17 @@ def report_of(experiment: Experiment) -> dict[str, Any]:
         "convention": optics.convention,
         "emission": optics.emission,
         "warnings": warnings_of(experiment),
-        **({} if rod is None else {"rod": _with_angles(experiment, rod)}),
+        **({"rod": _with_angles(experiment, rod)} if isinstance(rod, Rod) else {}),
     }
 
 
 def _with_angles(experiment: Experiment, rod: Rod) -> dict[str, Any]:
     """Bounds of a rod whose direction is unknown beside the free parameters of the mode."""
     free = (*FREE_PARAMETERS[experiment.config.fit.mode], *ANGLES)
-    found = rod_bounds(experiment.likelihood, experiment.theta, rod, free)
-    index = [ROD_PARAMETERS.index(name) for name in free]
+    rods = TurningRod(experiment.model, rod)
+    theta = np.insert(experiment.theta, LEVEL, [rod.azimuth_deg, rod.tilt_deg])
+    found = event_bounds(experiment.likelihood.under(rods), theta, free)
+    index = [i for i, each in enumerate(rods.parameters) if each.name in free]
     return {
         "aspect_ratio": experiment.config.particle.aspect_ratio,
         "azimuth_deg": rod.azimuth_deg,

@@ -1,4 +1,6 @@
-"""Which pupil would come nearest to what the light allows.
+"""Search for the best pupil: its variables, its figure of merit, and descents from starts.
+
+Which pupil would come nearest to what the light allows.
 
 Reference phase, attenuation, mask, focus and low Zernike terms are searched for the smallest
 
@@ -21,24 +23,225 @@ once more with the Zernike terms that are not round.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+import scipy
 
+from iscat_analysis.bounds.classical import bounds_from_matrices
 from iscat_analysis.bounds.experiment import Experiment, plan
 from iscat_analysis.bounds.holevo import Holevo, holevo_bound
-from iscat_analysis.bounds.pupil_search import KNOBS, NO_BOUND, OTHER_TERMS, Search, setting, sigmas
+from iscat_analysis.bounds.planning import calibrated_scale
 from iscat_analysis.bounds.quantum import transmitted_over_collected
-from iscat_analysis.bounds.scan import calibrated_scale
 from iscat_analysis.config import Config, Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.forward import MassScale
-from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Progress, silent
+from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Progress, silent
 
-FloatArray = NDArray[np.float64]
+ROUND_TERMS, OTHER_TERMS = ("z11",), ("z5", "z6", "z7", "z8", "z9", "z10")
+"""Low Zernike terms: spherical aberration, and astigmatism, coma and trefoil."""
+
+KNOBS: Mapping[str, tuple[str, ...]] = {
+    "focus": ("focus_nm",),
+    "phase": ("reference_phase_deg",),
+    "attenuation": ("attenuation",),
+    "mask": ("mask_na",),
+    "zernike": (*ROUND_TERMS, *OTHER_TERMS),
+}
+"""What can be searched, and the keys of ``[optics]`` it stands for."""
+
+SAMPLED = 128
+"""Random pupils for each variable, with and without mask, from which the valleys are chosen."""
+
+BUDGET = 70
+"""Evaluations that one descent may take for each of its variables."""
+
+RADII = (0.3, 2e-3)
+"""First and last step of a descent; a unit is a radian, 500 nm of focus, λ/20 rms of a Zernike
+term, a factor e of attenuation, the whole aperture for the mask."""
+
+APART = 0.5
+"""Smallest distance between starts, in these units."""
+
+FULL_WELL = 0.99
+"""Share of the well that the brightest pixel may expect."""
+
+SAME = 1e-4
+"""Relative change of F below which a knob returns to where it was configured: simpler is better."""
+
+NO_BOUND = 50.0
+"""ln F of a pupil that does not identify the parameters or saturates the camera."""
+
+_DIGITS = {"focus_nm": 1, "reference_phase_deg": 1, "mask_na": 3}  # of what is written; others 1
+_UNIT_FOCUS_NM = 500.0
+_WAVES = 20.0  # a unit of a Zernike term is the wavelength over this
+
+
+@dataclass
+class Search:
+    """F of pupils, and the descent into one valley."""
+
+    config: Config
+    scale: MassScale | None
+    chosen: tuple[str, ...]
+    free: tuple[str, ...]
+    evaluations: int = 0
+    keys: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.keys = tuple(key for name in KNOBS if name in self.free for key in KNOBS[name])
+
+    def config_of(self, optics: Optics) -> Config:
+        """Experiment with other optics and the same light on the particle."""
+        power = (optics.attenuation / self.config.optics.attenuation) ** 2
+        photons = self.config.bounds.photons_per_pixel * power
+        return self.config.model_copy(
+            update={
+                "optics": optics,
+                "bounds": self.config.bounds.model_copy(update={"photons_per_pixel": photons}),
+            }
+        )
+
+    def value(self, optics: Optics) -> tuple[float, Optics]:
+        """Compute ln F and the optics, dimmed where the well depth requires it."""
+        largest_e = FULL_WELL * (self.config.camera.well_depth_e or math.inf)
+        for _ in range(4):
+            self.evaluations += 1
+            experiment = plan(self.config_of(optics), scale=self.scale)
+            if experiment.peak_e <= largest_e:
+                sigma, own = sigmas(experiment)
+                at = [PARAMETERS.index(name) for name in self.chosen]
+                total = float(np.sum((sigma[at] / own[at]) ** 2))
+                return (math.log(total) if math.isfinite(total) else NO_BOUND), optics
+            if "attenuation" not in self.free:
+                break
+            dimmed = optics.attenuation * math.sqrt(0.99 * largest_e / experiment.peak_e)
+            optics = optics.model_copy(update={"attenuation": dimmed})
+        return NO_BOUND, optics
+
+    def valleys(self, starts: int, seed: int) -> list[tuple[list[str], FloatArray]]:
+        """Choose starts: the configured pupil, and the best of a sample with and without mask."""
+        keys = [key for key in self.keys if key not in OTHER_TERMS]
+        bare = [key for key in keys if key != "mask_na"]
+        here = self.config.optics
+        first = keys if here.mask_na else bare
+        chosen = [(first, self.encode(first, here))]
+        for number, names in enumerate([bare] if bare == keys else [bare, keys]):
+            if not names:
+                continue
+            rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0, number)))
+            low, high = np.array([self.range(key)[0] for key in names]).T
+            points = low + (high - low) * rng.random((SAMPLED * len(names), len(names)))
+            values = [self.value(self.decode(names, point))[0] for point in points]
+            distinct: list[FloatArray] = []
+            for point in points[np.argsort(values)]:
+                if len(distinct) < starts and all(
+                    np.linalg.norm(point - p) > APART for p in distinct
+                ):
+                    distinct.append(point)
+            chosen += [(names, point) for point in distinct]
+        return chosen
+
+    def descend(self, keys: list[str], start: FloatArray) -> tuple[float, Optics]:
+        """Find the lowest point near a start: ln F and the optics."""
+        if not keys:
+            return self.value(self.decode(keys, start))
+        low, high = np.array([self.range(key)[1] for key in keys]).T
+        found = scipy.optimize.minimize(
+            lambda point: self.value(self.decode(keys, point))[0],
+            np.clip(start, low, high),
+            bounds=list(zip(low, high, strict=True)),
+            method="COBYQA",
+            options={
+                "maxfev": BUDGET * len(keys),
+                "initial_tr_radius": RADII[0],
+                "final_tr_radius": RADII[1],
+            },
+        )
+        return self.value(self.decode(keys, found.x))
+
+    def simplified(self, best: Optics) -> tuple[float, Optics]:
+        """Round the settings, and undo those that change nothing."""
+        best = self._with(
+            best, {key: _rounded(key, setting(best, key)) for key in self.keys if key != "mask_na"
+                   or best.mask_na}
+        )  # fmt: skip
+        value, best = self.value(best)
+        worst = value + SAME
+        for key in reversed(self.keys):
+            here = setting(self.config.optics, key)
+            if setting(best, key) != here:
+                simpler = self.value(self._with(best, {key: here}))
+                if simpler[0] <= worst and simpler[1].attenuation <= best.attenuation:
+                    value, best = simpler
+        return value, best
+
+    def range(self, key: str) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Where a knob is sampled, and how far it may go."""
+        return {
+            "focus_nm": ((-4.0, 4.0), (-4.0, 4.0)),
+            "reference_phase_deg": ((-math.pi, math.pi), (-3 * math.pi, 3 * math.pi)),
+            "attenuation": ((math.log(3e-3), 0.0), (math.log(1e-4), 0.0)),
+            "mask_na": ((0.1, 0.95), (0.05, 0.99)),
+        }.get(key, ((-2.0, 2.0), (-8.0, 8.0)))
+
+    def encode(self, keys: Sequence[str], optics: Optics) -> FloatArray:
+        """Optics → point of the search."""
+        return np.array([self._coding(key)[0](setting(optics, key)) for key in keys])
+
+    def decode(self, keys: Sequence[str], point: FloatArray) -> Optics:
+        """Point of the search → optics; a mask that is not among the keys is taken out."""
+        changes = {key: self._coding(key)[1](float(u)) for key, u in zip(keys, point, strict=True)}
+        if "mask_na" in self.keys and "mask_na" not in keys:
+            changes["mask_na"] = 0.0
+        return self._with(self.config.optics, changes)
+
+    def _coding(self, key: str) -> tuple[Callable[[float], float], Callable[[float], float]]:
+        optics, height = self.config.optics, self.config.particle.nominal_height_nm
+        wave = optics.wavelength_nm / _WAVES
+        if key == "focus_nm":
+            return (lambda v: (v - height) / _UNIT_FOCUS_NM, lambda u: height + _UNIT_FOCUS_NM * u)
+        if key == "reference_phase_deg":
+            return math.radians, lambda u: math.degrees(math.remainder(u, 2 * math.pi))
+        if key == "attenuation":
+            return math.log, lambda u: math.exp(min(u, 0.0))
+        if key == "mask_na":
+            return lambda v: v / optics.na, lambda u: u * optics.na
+        return lambda v: v / wave, lambda u: u * wave
+
+    def _with(self, optics: Optics, changes: Mapping[str, float]) -> Optics:
+        terms = {k: v for k, v in changes.items() if k not in Optics.model_fields}
+        update: dict[str, Any] = {k: v for k, v in changes.items() if k not in terms}
+        if terms:
+            distinct = {k: v for k, v in (optics.aberrations_nm | terms).items() if v}
+            update["aberrations_nm"] = distinct
+        return optics.model_copy(update=update | {"file": None, "covariance": None})
+
+
+def setting(optics: Optics, key: str) -> float:
+    """Give the value of a key of the optics, or of a Zernike term."""
+    if key in Optics.model_fields:
+        return float(getattr(optics, key))
+    return optics.aberrations_nm.get(key, 0.0)
+
+
+def _rounded(key: str, value: float) -> float:
+    if key == "attenuation":
+        return float(f"{value:.3g}")
+    return round(value, _DIGITS.get(key, 1)) + 0.0
+
+
+def sigmas(experiment: Experiment) -> tuple[FloatArray, FloatArray]:
+    """Give the joint bounds over the mode's free parameters, and each one's quantum bound.
+
+    Shapes: `joint, quantum` (4,).
+    """
+    free = FREE_PARAMETERS[experiment.config.fit.mode]
+    whole = experiment.bounds(PARAMETERS)
+    return bounds_from_matrices(whole.fisher, whole.quantum, free).crb_joint, whole.qcrb
+
 
 SEARCHED_NM = 3500.0
 """Side of the field in which valleys are searched; candidates are compared on the whole field."""

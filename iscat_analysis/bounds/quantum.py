@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.aperture import Aperture, aperture
 from iscat_analysis.optics.forward import ForwardModel
-from iscat_analysis.optics.rods import Rod
+from iscat_analysis.optics.scatterers import Rod
 from iscat_analysis.optics.sized import MASS_STEP, SizedModel
 
 FloatArray = NDArray[np.float64]

@@ -5,19 +5,46 @@ microscope, p.  If p is off by δp, the estimate of θ moves by D δp with D = �
 particle does to imitate the change of the picture.  A covariance Σ of the microscope becomes
 D Σ Dᵀ.  The same blocks say what the particle tells of the microscope once its own unknowns are
 fitted, I_pp − I_pθ I_θθ⁻¹ I_θp.
+
+How well particles would tell the microscope, before they are recorded.
+
+The information that each expected picture holds about the optics, once the particle's own place,
+mass and level are fitted, adds up over the pictures, with that of the prior; the inverse of the sum
+is the covariance that `iscat calibrate optics` will report.  What it leaves in the masses and
+heights of later fits follows from `iscat_analysis.bounds.shared`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from iscat_analysis.bounds.classical import event_bounds
+from iscat_analysis.bounds.experiment import detector, expected_likelihood
+from iscat_analysis.config import Config, refuse_rod
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.checks import number_in
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, ForwardModel
-from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.records import PARAMETERS, FloatArray
+from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, ForwardModel, forward_model
+from iscat_analysis.optics.parameters import (
+    FAINTEST,
+    FREE,
+    MOST_IMAGES,
+    are_told,
+    exists,
+    free_groups,
+    prior_of,
+    settings_of,
+)
+from iscat_analysis.optics.pixels import PixelGrid
+from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
+from iscat_analysis.threads import one_thread_algebra
 
 _PEAK_POINTS = 61  # per axis, of the grid on which the peak of a contrast is looked for
 _PEAK_NM = 0.1  # to which it is found
@@ -36,20 +63,14 @@ def joint_information(
 
     Shapes: `theta` (5,), `others` (ny, nx) each, result (n, n).
     """
-    x, y, z, amplitude, level = (float(value) for value in theta)
+    x, y, z, amplitude, level = theta.tolist()
     model, grid = likelihood.model, likelihood.grid
-    signal, own = model.amplitude_gradient(grid, x, y, z, amplitude)
+    signal, own = model.signal(grid, theta[:4])
     further = [*others]
     if names:
         place = (grid, x, y, z, float(model.scale.mass(np.array(amplitude))))
         further += [*model.joint_gradient(*place, names)[2]]
-    rows = np.empty((len(further) + 5, signal.size))
-    for row, derivative in zip(rows, [*further, *own], strict=False):
-        row[:] = derivative.ravel()
-    _, _, information, by_signal, by_level = likelihood.noise.terms(likelihood.data, signal, level)
-    rows[:-1] *= by_signal.ravel()
-    rows[-1] = by_level.ravel()
-    return np.asarray((rows * information.ravel()) @ rows.T)
+    return likelihood.score_of_signal(signal, np.array([*further, *own]), level)[2]
 
 
 def eliminated(information: FloatArray, shared: int) -> FloatArray:
@@ -142,3 +163,279 @@ def shared_sigma(moves: FloatArray, covariance: FloatArray) -> FloatArray:
     """
     variance = np.einsum("ki,ij,kj->k", moves, covariance, moves)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+EVENTS = 60
+"""Particles where nobody says how many."""
+
+GOALS = (("focus_nm", 5.0), ("mass_rel", 0.01))
+"""Precisions whose price is told: of the focus [nm], and the common relative error of masses."""
+
+FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
+"""Masses, over the configured one, for which it is told."""
+
+MODES = ("mass", "localize", "joint")
+"""Modes of fits whose common errors are told."""
+
+_PHASES = 3  # places inside a pixel, per axis, over which particles are spread
+_MANY = 10**6  # events that tell whatever particles of this kind can tell at all
+_Z = 2  # of x, y, z, mass, level: what is given
+_ZERO = 1e-9  # what symmetry makes 0 [nm, kDa]
+
+
+@dataclass(frozen=True, eq=False)
+class OpticsForecast:
+    """What a number of particles would tell of the microscope."""
+
+    config: Config
+    events: int
+    snr: float
+    values: dict[str, float]
+    covariance: FloatArray
+    usual: FloatArray
+    moves: dict[str, FloatArray]
+    sigma: dict[str, FloatArray]
+    needed: pd.DataFrame
+
+    @cached_property
+    def parameters(self) -> pd.DataFrame:
+        """One row per free parameter, with its error after the pictures and before them."""
+        sigma = np.sqrt(np.diag(self.covariance))
+        columns = {
+            "parameter": list(self.values), "value": list(self.values.values()), "sigma": sigma,
+            "usual_error": self.usual, "determined": are_told(sigma, self.usual),
+        }  # fmt: skip
+        return pd.DataFrame(columns)
+
+    @cached_property
+    def common(self) -> dict[str, dict[str, float]]:
+        """Standard deviation that the microscope's errors put into all fits alike, by mode."""
+        return {
+            mode: dict(
+                zip(
+                    FREE_PARAMETERS[mode],
+                    (float(s) if s > _ZERO else 0.0 for s in shared_sigma(moves, self.covariance)),
+                    strict=True,
+                )
+            )
+            for mode, moves in self.moves.items()
+        }
+
+    @property
+    def unidentifiable(self) -> tuple[str, ...]:
+        """What the pictures would not tell, one sentence each."""
+        untold = self.parameters[~self.parameters["determined"]]
+        return tuple(
+            f"{row.parameter} would be known to ±{row.sigma:.3g}, and to ±{row.usual_error:g} "
+            "without any picture ([uncertainty] optics)"
+            for row in untold.itertuples()
+        )
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know, one sentence each."""
+        found = []
+        if self.snr < FAINTEST:
+            found.append(
+                f"one picture has a signal-to-noise ratio of {self.snr:.2g}, and iscat calibrate "
+                f"optics uses those above {FAINTEST:g}: take heavier particles, more frames, or "
+                "more light"
+            )
+        if self.events > MOST_IMAGES:
+            found.append(
+                f"of {self.events} pictures iscat calibrate optics uses the {MOST_IMAGES} brightest"
+            )
+        return tuple(found)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give what ``iscat bounds --for optics --json`` prints."""
+        optics, at = self.config.optics, self.config.bounds
+        mass = float(self.needed["mass_kda"][FACTORS.index(1.0)])
+        return {
+            "events": self.events,
+            "at": {
+                "mass_kda": mass,
+                "height_nm": self.config.particle.nominal_height_nm,
+                "focus_nm": optics.focus_nm,
+                "na": optics.na,
+                "photons_per_pixel": at.photons_per_pixel,
+                "n_before": at.n_before,
+                "n_after": at.n_after,
+                "roi_nm": self.config.fit.roi_nm,
+                "pixel_size_nm": self.config.camera.pixel_size_nm,
+            },
+            "snr": self.snr,
+            "parameters": self.parameters.to_dict("records"),
+            "names": list(self.values),
+            "covariance": self.covariance,
+            "unidentifiable": list(self.unidentifiable),
+            "common": self.common,
+            "single": {
+                mode: dict(zip(FREE_PARAMETERS[mode], sigma, strict=True))
+                for mode, sigma in self.sigma.items()
+            },
+            "goals": dict(GOALS),
+            "warnings": list(self.warnings),
+            "needed": self.needed.to_dict("records"),
+        }
+
+
+@one_thread_algebra()
+def forecast_optics(
+    config: Config, *, events: int = EVENTS, free: str | Sequence[str] | None = None
+) -> OpticsForecast:
+    """Foresee what particles would tell of the microscope."""
+    refuse_rod(config, "optics are learned from round particles")
+    names = _names(config, free)
+    number_in("`events`", events, least=1, whole=True)
+    model, grid = _model(config)
+    pictures = {f: _Picture.expected(config, model, grid, f, names) for f in FACTORS}
+    here = pictures[1.0]
+    usual = prior_of(config).errors(names)
+    settings = settings_of(config)
+    return OpticsForecast(
+        config=config,
+        events=events,
+        snr=here.snr,
+        values={name: float(settings[name]) for name in names},
+        covariance=_known(here.information * events, usual),
+        usual=usual,
+        moves={mode: here.moves(mode) for mode in MODES},
+        sigma={mode: here.sigma(mode) for mode in MODES},
+        needed=pd.DataFrame([_needed(picture, names, usual) for picture in pictures.values()]),
+    )
+
+
+def _names(config: Config, free: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Give the continuous parameters that these groups stand for in this microscope."""
+    optics = config.optics
+    if optics.scheme == "darkfield" or optics.convention == "dong2021":
+        raise ConfigError(
+            f'optics.scheme = "{optics.scheme}", optics.convention = "{optics.convention}": optics '
+            'are learned from interference with a reference, in the convention "exact"'
+        )
+    settings = settings_of(config)
+    names = tuple(
+        name for group in free_groups(free) for name in FREE[group] if exists(name, settings)
+    )
+    if not names:
+        raise ConfigError(f"free = {free!r}: this microscope has no such continuous parameter")
+    return names
+
+
+def _model(config: Config) -> tuple[ForwardModel, PixelGrid]:
+    pixel, _ = detector(config)
+    grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
+    reach = grid.diagonal_nm / 2 + pixel
+    return forward_model(config, reach, z_max_nm=config.particle.nominal_height_nm), grid
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """One expected particle, averaged over its place in a pixel."""
+
+    likelihoods: tuple[Likelihood, ...]
+    thetas: tuple[FloatArray, ...]
+    names: tuple[str, ...]
+    mass_kda: float
+    level: bool
+    information: FloatArray
+
+    @classmethod
+    def expected(
+        cls,
+        config: Config,
+        model: ForwardModel,
+        grid: PixelGrid,
+        factor: float,
+        names: tuple[str, ...],
+    ) -> _Picture:
+        at, mass = config.bounds, factor * model.material.mass_kda
+        steps = grid.pixel_nm * ((np.arange(_PHASES) + 0.5) / _PHASES - 0.5)
+        thetas = tuple(
+            np.array([x, y, config.particle.nominal_height_nm, model.scale.amplitude(mass), 0.0])
+            for y in steps
+            for x in steps
+        )
+        likelihoods = tuple(
+            expected_likelihood(
+                model, grid, theta, at.photons_per_pixel, at.photons_per_pixel,
+                n_before=at.n_before, n_after=at.n_after,
+                read_noise_e=float(config.camera.assumed.read_noise_e),
+            )
+            for theta in thetas
+        )  # fmt: skip
+        count = len(names)
+        parts = []
+        for likelihood, theta in zip(likelihoods, thetas, strict=True):
+            whole = joint_information(likelihood, theta, names)
+            fitted = [i for i in range(count + 5) if i != count + _Z]
+            parts.append(eliminated(whole[np.ix_(fitted, fitted)], count))
+        level = config.background.method == "sliding"
+        return cls(likelihoods, thetas, names, mass, level, np.asarray(np.mean(parts, axis=0)))
+
+    @property
+    def snr(self) -> float:
+        """Of the brightest place in a pixel's middle."""
+        middle = len(self.thetas) // 2
+        likelihood, theta = self.likelihoods[middle], self.thetas[middle]
+        signal = likelihood.signal(theta)
+        return math.sqrt(float(np.sum(signal**2 * likelihood.signal_information(signal))))
+
+    def moves(self, mode: str) -> FloatArray:
+        """D of a mode, averaged over the places."""
+        found = [
+            displacement(likelihood, theta, self.names, FREE_PARAMETERS[mode], level=self.level)
+            for likelihood, theta in zip(self.likelihoods, self.thetas, strict=True)
+        ]
+        return np.asarray(np.mean(found, axis=0))
+
+    def sigma(self, mode: str) -> FloatArray:
+        """Bounds of a mode, averaged over the places."""
+        free = FREE_PARAMETERS[mode]
+        found = [
+            event_bounds(likelihood, theta, free, 1.0, level=self.level).crb_joint
+            for likelihood, theta in zip(self.likelihoods, self.thetas, strict=True)
+        ]
+        joint = np.sqrt(np.mean(np.square(found), axis=0))
+        return np.asarray(joint[np.isfinite(joint)])
+
+
+def _known(information: FloatArray, usual: FloatArray) -> FloatArray:
+    """Give the covariance of the optics after pictures, from their information and the prior.
+
+    Shapes: `information`, result (n, n); `usual` (n,).
+    """
+    both = np.outer(usual, usual)
+    return np.asarray(np.linalg.inv(information * both + np.eye(usual.size)) * both)
+
+
+def _needed(picture: _Picture, names: Sequence[str], usual: FloatArray) -> dict[str, float]:
+    """Say how many events the goals take, and how many tell what can be told at all."""
+    moves, mass_row = picture.moves("mass"), FREE_PARAMETERS["mass"].index("mass_kda")
+
+    def errors(events: float) -> tuple[FloatArray, float]:
+        covariance = _known(picture.information * events, usual)
+        mass = shared_sigma(moves, covariance)[mass_row] / picture.mass_kda
+        return np.sqrt(np.diag(covariance)), float(mass)
+
+    def least(reached: Callable[[float], bool]) -> float:
+        """Find the number of events that suffices, by halves."""
+        low, high = 0, _MANY
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if reached(middle) else (middle, high)
+        return float(high) if reached(high) else math.nan
+
+    can = are_told(errors(_MANY)[0], usual)
+    goals = dict(GOALS)
+    focus = names.index("focus_nm") if "focus_nm" in names else None
+    return {
+        "mass_kda": picture.mass_kda,
+        "snr": picture.snr,
+        "identified": least(lambda n: bool(are_told(errors(n)[0], usual)[can].all())),
+        "focus_nm": math.nan
+        if focus is None
+        else least(lambda n: bool(errors(n)[0][focus] <= goals["focus_nm"])),
+        "mass_rel": least(lambda n: errors(n)[1] <= goals["mass_rel"]),
+    }

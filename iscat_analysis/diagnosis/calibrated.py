@@ -59,7 +59,7 @@ from iscat_analysis.fitting.ranges import (
 )
 from iscat_analysis.fitting.run import Notify, notify_nobody
 from iscat_analysis.movie import Stack
-from iscat_analysis.pieces.setups import darkfield_photons
+from iscat_analysis.pieces.counts import darkfield_photons
 from iscat_analysis.records import Status
 from iscat_analysis.search.chunks import reader_of, sum_first_chunk
 from iscat_analysis.threads import one_thread_algebra, start_in_thread

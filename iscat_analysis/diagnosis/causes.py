@@ -23,8 +23,8 @@ from iscat_analysis.inference.fit import OUTWARD
 from iscat_analysis.medians import robust_sigma
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.scale import MassScale
-from iscat_analysis.optics.seated import VESICLE
-from iscat_analysis.optics.spheres import has_shells
+from iscat_analysis.optics.scatterers import has_shells
+from iscat_analysis.optics.sized import VESICLE
 from iscat_analysis.records import FloatArray, Status, Windows, has_flag
 from iscat_analysis.search.frames import DARK, well_lit
 from iscat_analysis.trust.systematic import is_bent

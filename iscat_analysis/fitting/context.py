@@ -13,15 +13,15 @@ from iscat_analysis.inference.counts import KNOWN, MEAN, MEDIAN
 from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.heights import height_prior
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.optics.field_map import terms_of
 from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.optics.local import (
     LocalModels,
     ModelsFrom,
     refuse_moving_focus,
     refuse_uneven_field,
+    terms_of,
 )
-from iscat_analysis.optics.seated import SeatedModel, seated_models
+from iscat_analysis.optics.sized import SeatedModel, seated_models
 from iscat_analysis.optics.stamp import margin_nm
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray
 from iscat_analysis.search.frames import Tile

@@ -20,17 +20,16 @@ from iscat_analysis.camera import smooth_background
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.particles import INDEX_UNKNOWN
 from iscat_analysis.fitting.context import AnalysisContext, is_counted
+from iscat_analysis.inference.common_size import fit_index
 from iscat_analysis.inference.counts import MEAN, choose_noise, counts_likelihood
-from iscat_analysis.inference.free_index import fit_index
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.posterior import sample_posterior
-from iscat_analysis.inference.prior import Prior
+from iscat_analysis.inference.posterior import Prior, sample_posterior
 from iscat_analysis.inference.recognition import may_be_large, recognised
-from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.optics.seated import SeatedModel
+from iscat_analysis.optics.model import photons_per_intensity
+from iscat_analysis.optics.sized import SeatedModel
+from iscat_analysis.pieces.counts import darkfield_photons
 from iscat_analysis.pieces.regions import saturated_near
-from iscat_analysis.pieces.setups import darkfield_photons
 from iscat_analysis.records import (
     Candidate,
     FitResult,

@@ -35,7 +35,7 @@ from iscat_analysis.fitting.events import (
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.recognition import may_be_large, refitted
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.optics.seated import SeatedModel
+from iscat_analysis.optics.sized import SeatedModel
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     Candidate,

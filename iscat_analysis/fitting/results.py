@@ -14,9 +14,8 @@ from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.camera import Trajectory
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event, Fitted, photons_scale
-from iscat_analysis.inference.nuisances import NOTHING, Evidence, evidence_of
-from iscat_analysis.inference.pairs import pair_of
-from iscat_analysis.optics.collected import collected_area_nm2
+from iscat_analysis.inference.nuisances import NOTHING, Evidence, evidence_of, pair_of
+from iscat_analysis.optics.model import collected_area_nm2
 from iscat_analysis.pieces.regions import line_of
 from iscat_analysis.records import (
     DIPOLE,

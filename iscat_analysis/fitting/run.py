@@ -30,8 +30,8 @@ from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.files import whole_file
 from iscat_analysis.findings import Finding, Findings, existing, remark
 from iscat_analysis.fitting.context import AnalysisContext
+from iscat_analysis.inference.fit import compile_kernels, parts_of
 from iscat_analysis.inference.heights import has_prior
-from iscat_analysis.inference.noise import compile_kernels, parts_of
 from iscat_analysis.reading import npz_of, parquet_of, read_bytes, read_json
 from iscat_analysis.records import FREE_PARAMETERS, Clip, EventView, Progress, Trace, silent
 

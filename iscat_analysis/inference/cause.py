@@ -19,7 +19,7 @@ import numpy as np
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.fit import AMPLITUDE
-from iscat_analysis.inference.likelihood import LEVEL, Likelihood
+from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.records import BoolArray, FloatArray
 
@@ -247,14 +247,13 @@ class _Left:
         used = np.isfinite(residual)
         signal = likelihood.signal(theta)
         root = np.sqrt(likelihood.signal_information(signal))[used]
-        _, first, _ = likelihood.model.amplitude_hessian(
-            likelihood.grid, *(float(t) for t in theta[:4])
-        )
-        columns = [first[i][used] * root for i in range(4) if free[i]]
-        if free[LEVEL]:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                level = likelihood.noise.level_direction(likelihood.data, signal)
-            columns.append(level[used] * root)
+        _, first = likelihood.model.signal(likelihood.grid, theta[:4])
+        level = likelihood.noise.terms(likelihood.data, signal, 0.0).by_level
+        columns = [
+            each[used] * root
+            for each, is_free in zip([*first, level], free, strict=True)
+            if is_free
+        ]
         fitted, _ = np.linalg.qr(np.stack(columns, axis=1))
         rest = residual[used]
         mass = float(likelihood.model.scale.mass(theta[3]))

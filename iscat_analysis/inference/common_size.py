@@ -23,13 +23,20 @@ information (T. A. Louis, J. R. Stat. Soc. B 44, 226, 1982)
 
 The likeliest height alone would follow the noise: of 24 vesicles of 200 nm in twelve faint frames,
 it gave one the diameter 76 nm, and the others pulls 1.5 wide.
+
+Diameter and refractive index of a sphere from one picture.
+
+A small sphere scatters with d³ (n − n_s), and its picture tells that product and neither factor.  A
+larger one changes its picture in another way with d than with n.  What a picture tells is in the
+information about ln d and ln (n − n_s), with the place eliminated: the eigenvector (q, 1) of its
+larger eigenvalue is the combination d^q (n − n_s).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -37,18 +44,22 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels.hessian import PAIRS
 from iscat_analysis._kernels.scoring import LARGEST_GAIN_RATIO
-from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise_models import PixelTerms
+from iscat_analysis.inference.fit import AMPLITUDE, fit_particle
+from iscat_analysis.inference.laws import PixelTerms
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood
+from iscat_analysis.inference.maximiser import Optimum, covariance_of, maximise
+from iscat_analysis.inference.models import ParticleModel, SphereOfIndex
 from iscat_analysis.inference.sizes import (
+    OTHER_SIZE,
+    SURE_ODDS,
     highest_maxima,
     scan_sizes,
     scanned_heights,
     scanned_masses,
-    slopes_with_index,
 )
 from iscat_analysis.optics.sized import SizedModel
+from iscat_analysis.records import BoolArray, Box, Candidate, FitResult, FloatArray, Status, verdict
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 FOLLOWED, HEIGHTS = 4, 3
@@ -58,9 +69,6 @@ GIVEN_UP = 30.0
 """Log-likelihood below the best maximum at which another is given up, when its next scoring step
 could not reach more."""
 
-TOLERANCE = 1e-3
-"""Gain of log-likelihood, as a scoring step expects it, at which the fit ends."""
-
 UNDETERMINED = 0.5
 """Error of n − n_s, over its size, from which the index is not told."""
 
@@ -68,10 +76,9 @@ APART = 1 / 8
 """Share of a fringe by which two heights of a frame differ at least."""
 
 _LEAST_KNOWN = 1e-6  # of what a frame of one height would tell, is told by one of several
-_PASSES = 40
 _TURNED = 0.5  # share of a step by which the next goes back, where both go too far
 _GROWTH = 0.2  # largest relative change of the mass in a step, and of n − n_s
-_HALVINGS = 12
+_SHORTER = 1e3  # a damped step is as much shorter, times the damping: half of it at first
 
 
 @dataclass(frozen=True)
@@ -181,52 +188,28 @@ def fit_common_size(
 
     Shapes: `places` (n, 3) or (n, 4), `frames` (n,).
     """
-    free_index = index is not None
-    common = np.array([mass_kda, index] if index is not None else [mass_kda])
-    rows = places.copy()
+    common = np.array([mass_kda] if index is None else [mass_kda, index])
+    rows, owners = places.copy(), np.arange(len(likelihoods)) if frames is None else frames
     rows[:, 2] = np.clip(rows[:, 2], *z_range_nm)
-    owners = np.arange(len(likelihoods)) if frames is None else frames
-
-    def gathered(at: FloatArray, trial: FloatArray) -> _Frames:
-        return _gathered(likelihoods, model, (at, owners), trial, z_range_nm, motion)
-
-    here = gathered(rows, common)
-    if not math.isfinite(here.value):
-        return None
+    joint = _Joint(likelihoods, model, z_range_nm, motion, common.size)
     converged = False
-    before, damping = np.zeros_like(rows), np.ones(len(rows))
-    for _ in range(_PASSES):
+    while True:
+        here = joint.gathered(rows, owners, common)
+        if not math.isfinite(here.value):
+            return None
         kept = _still_likely(here, rows, owners, APART * model.fringe_nm)
-        if not kept.all():
-            rows, owners = rows[kept], owners[kept]
-            before, damping = before[kept], damping[kept]
-            here = gathered(rows, common)
-        step, moves, gain = _scoring_step(here)
-        back = -np.sum(moves * before, axis=1) > _TURNED * np.sum(before**2, axis=1)
-        damping = np.where(back, damping / 2, damping)
-        before, moves = moves, damping[:, None] * moves
-        if gain < TOLERANCE:
-            converged = True
+        if kept.all() and converged:
             break
-        if here.value + LARGEST_GAIN_RATIO * gain < least:
+        rows, owners = rows[kept], owners[kept]
+        found = joint.maximised(rows, owners, common, least)
+        common, rows = found.theta[: common.size], found.theta[common.size :].reshape(rows.shape)
+        if not found.converged:
+            here, converged = joint.gathered(rows, owners, common), False
             break
-        size = np.abs(common - [0.0, model.optics.n_sample][: step.size])
-        largest = np.abs(step) / (_GROWTH * size)
-        far = np.abs(moves) / (0.1 * model.optics.wavelength_nm)
-        share = 1 / max(1.0, float(largest.max()), float(far.max()))
-        for _ in range(_HALVINGS):
-            trial, at = common + share * step, rows + share * moves
-            at[:, 2] = np.clip(at[:, 2], *z_range_nm)
-            there = gathered(at, trial)
-            if there.value >= here.value - 0.1 * TOLERANCE:
-                break
-            share /= 2
-        else:
-            break
-        common, rows, here = trial, at, there
+        converged = True
     return CommonSize(
         mass_kda=float(common[0]),
-        index=float(common[1]) if free_index else model.sphere.index.real,
+        index=float(common[1]) if index is not None else model.sphere.index.real,
         likely=rows,
         frames=owners,
         places=rows[_best_of_each(here.values, owners)],
@@ -234,7 +217,7 @@ def fit_common_size(
         log_weight=_log_weight(here, owners),
         information=here.information,
         prior=here.prior,
-        bias=_bias(likelihoods, model, (rows, owners), common, here),
+        bias=_bias(joint, rows, owners, common, here),
         converged=converged,
     )
 
@@ -255,53 +238,111 @@ class _Frames(NamedTuple):
     scale: float  # diameter over 3 m
 
 
-def _model_of(model: SizedModel, common: FloatArray) -> SizedModel:
-    """Give the model of an index, or the same."""
-    return model if common.size == 1 else model.of_index(float(common[1]))
+@dataclass(frozen=True)
+class _Joint:
+    """The likelihood of all frames, of `count` common parameters."""
 
+    likelihoods: Sequence[Likelihood]
+    model: SizedModel
+    z_range_nm: tuple[float, float]
+    motion: tuple[float, float] | None
+    count: int
 
-def _gathered(
-    likelihoods: Sequence[Likelihood],
-    model: SizedModel,
-    places: tuple[FloatArray, IntArray],
-    common: FloatArray,
-    z_range_nm: tuple[float, float],
-    motion: tuple[float, float] | None,
-) -> _Frames:
-    """Compute value, scores and information of all frames."""
-    (n, p), k = places[0].shape, common.size
-    values, scores, pulls = np.full(n, -math.inf), np.zeros((n, p)), np.zeros((n, k))
-    known, inverse, mixed = np.zeros((n, k, k)), np.zeros((n, p, p)), np.zeros((n, p, k))
-    mass = float(common[0])
-    for b, (place, f) in enumerate(zip(*places, strict=True)):
-        terms, rows = _terms(likelihoods[f], model, place, common)
-        if not math.isfinite(terms.value):
-            continue
-        flat = rows.reshape(p + k, -1)
-        score = flat @ terms.score.ravel()
-        fisher = (flat * terms.information.ravel()) @ flat.T
-        z, down = place[2], score[2] < 0
-        free = np.ones(p, dtype=bool)
-        free[2] = not (z <= z_range_nm[0] if down else z >= z_range_nm[1])
-        held = np.ix_(free, free)
-        inverse[b][held] = np.linalg.inv(fisher[:p, :p][held])
-        values[b], scores[b], mixed[b] = terms.value, score[:p], fisher[:p, p:]
-        known[b] = fisher[p:, p:] - mixed[b].T @ inverse[b] @ mixed[b]
-        pulls[b] = score[p:] - mixed[b].T @ inverse[b] @ score[:p]
-    value, shares = _shared(values, places[1], len(likelihoods))
-    pull, prior = shares @ pulls, np.zeros((k, k))
-    diameter = model.sphere.of_mass(mass).diameter_nm
-    if motion is not None:
-        off, slope = 1 / diameter - motion[0], -1 / (3 * mass * diameter)
-        value -= 0.5 * (off / motion[1]) ** 2
-        pull[0] -= off * slope / motion[1] ** 2
-        prior[0, 0] = (slope / motion[1]) ** 2
-    information = _of_frames(known, pulls, shares, places[1], len(likelihoods))
-    expected = np.tensordot(shares, known, axes=1) + prior
-    return _Frames(
-        value, pull, expected, information, prior, values, shares, scores, inverse, mixed,
-        diameter / (3 * mass),
-    )  # fmt: skip
+    @property
+    def particle(self) -> ParticleModel:
+        """Sphere of a known index, or of one that is fitted."""
+        return self.model if self.count == 1 else SphereOfIndex(self.model)
+
+    def maximised(
+        self, rows: FloatArray, owners: IntArray, common: FloatArray, least: float
+    ) -> Optimum:
+        """Maximise over c and all places, of which θ consists in this order."""
+        k, shape = self.count, rows.shape
+        last, shorter = np.zeros(shape), np.ones(len(rows))
+
+        def gathered(theta: FloatArray) -> tuple[float, FloatArray, _Frames]:
+            here = self.gathered(theta[k:].reshape(shape), owners, theta[:k])
+            places = here.shares[:, None] * here.place_score
+            raw = here.pull + np.einsum("bik,bij,bj->k", here.mixed, here.place_inverse, places)
+            return here.value, np.concatenate([raw, places.ravel()]), here
+
+        def step_of(
+            _score: FloatArray, here: _Frames, _active: BoolArray, damping: float
+        ) -> FloatArray | None:
+            """Eliminate the places; those that step to and fro take shorter steps."""
+            nonlocal last, shorter
+            try:
+                step = np.linalg.solve(here.known, here.pull)
+            except np.linalg.LinAlgError:
+                return None
+            left = here.place_score - here.mixed @ step
+            moves = np.einsum("bij,bj->bi", here.place_inverse, left)
+            if not damping:
+                back = -np.sum(moves * last, axis=1) > _TURNED * np.sum(last**2, axis=1)
+                last, shorter = moves, np.where(back, shorter / 2, shorter)
+            far = np.abs(moves).max(axis=1) / (0.1 * self.model.optics.wavelength_nm)
+            moves = moves * (shorter / np.maximum(far, 1.0))[:, None]
+            whole = np.concatenate([step, moves.ravel()])
+            return np.asarray(whole / (1 + _SHORTER * damping), dtype=np.float64)
+
+        def farthest(theta: FloatArray) -> FloatArray:
+            out = np.full(theta.size, math.inf)
+            out[:k] = _GROWTH * np.abs(theta[:k] - [0.0, self.model.optics.n_sample][:k])
+            return out
+
+        lower, upper = np.full((2, k + rows.size), math.inf) * [[-1], [1]]
+        lower[k:].reshape(shape)[:, 2], upper[k:].reshape(shape)[:, 2] = self.z_range_nm
+        box = Box(np.ones(lower.size, dtype=bool), lower, upper)
+        start = np.concatenate([common, rows.ravel()])
+        return maximise(gathered, start, box, farthest, least=least, step_of=step_of)
+
+    def gathered(self, rows: FloatArray, owners: IntArray, common: FloatArray) -> _Frames:
+        """Compute value, scores and information of all frames."""
+        (n, p), k = rows.shape, self.count
+        values, scores, pulls = np.full(n, -math.inf), np.zeros((n, p)), np.zeros((n, k))
+        known, inverse, mixed = np.zeros((n, k, k)), np.zeros((n, p, p)), np.zeros((n, p, k))
+        mass = float(common[0])
+        for b, (place, f) in enumerate(zip(rows, owners, strict=True)):
+            terms, slopes = self.terms(self.likelihoods[f], place, common)
+            if not math.isfinite(terms.value):
+                continue
+            flat = slopes.reshape(p + k, -1)
+            score = flat @ terms.score.ravel()
+            fisher = (flat * terms.information.ravel()) @ flat.T
+            z, down = place[2], score[2] < 0
+            free = np.ones(p, dtype=bool)
+            free[2] = not (z <= self.z_range_nm[0] if down else z >= self.z_range_nm[1])
+            inside = np.ix_(free, free)
+            inverse[b][inside] = np.linalg.inv(fisher[:p, :p][inside])
+            values[b], scores[b], mixed[b] = terms.value, score[:p], fisher[:p, p:]
+            known[b] = fisher[p:, p:] - mixed[b].T @ inverse[b] @ mixed[b]
+            pulls[b] = score[p:] - mixed[b].T @ inverse[b] @ score[:p]
+        value, shares = _shared(values, owners, len(self.likelihoods))
+        pull, prior = shares @ pulls, np.zeros((k, k))
+        diameter = self.model.sphere.of_mass(mass).diameter_nm
+        if self.motion is not None:
+            off, slope = 1 / diameter - self.motion[0], -1 / (3 * mass * diameter)
+            value -= 0.5 * (off / self.motion[1]) ** 2
+            pull[0] -= off * slope / self.motion[1] ** 2
+            prior[0, 0] = (slope / self.motion[1]) ** 2
+        information = _of_frames(known, pulls, shares, owners, len(self.likelihoods))
+        expected = np.tensordot(shares, known, axes=1) + prior
+        return _Frames(
+            value, pull, expected, information, prior, values, shares, scores, inverse, mixed,
+            diameter / (3 * mass),
+        )  # fmt: skip
+
+    def terms(
+        self, likelihood: Likelihood, place: FloatArray, common: FloatArray
+    ) -> tuple[PixelTerms, FloatArray]:
+        """Terms of the likelihood of a frame, and the slopes of its signal in places and c.
+
+        Shapes: `place` (p,), `common` (k,), slopes (p + k, ny, nx).
+        """
+        signal, slopes = self.particle.signal(likelihood.grid, [*place[:3], *common])
+        level = float(place[3]) if place.size > 3 else 0.0
+        terms = likelihood.noise.terms(likelihood.data, signal, level)
+        return terms, np.insert(slopes, 3, terms.by_level, axis=0) if place.size > 3 else slopes
 
 
 def _shared(values: FloatArray, owners: IntArray, frames: int) -> tuple[float, FloatArray]:
@@ -359,43 +400,6 @@ def _best_of_each(values: FloatArray, owners: IntArray) -> IntArray:
     return np.asarray(order[np.unique(owners[order], return_index=True)[1]])
 
 
-def _terms(
-    likelihood: Likelihood, model: SizedModel, place: FloatArray, common: FloatArray
-) -> tuple[PixelTerms, FloatArray]:
-    """Terms of the likelihood of a frame, and the slopes of its expectation in places and c.
-
-    Shapes: `place` (p,), `common` (k,), rows (p + k, ny, nx).
-    """
-    signal, rows = slopes(likelihood, model, place[:3], common)
-    level = float(place[3]) if place.size > 3 else 0.0
-    terms = likelihood.noise.terms(likelihood.data, signal, level)
-    rows = rows * terms.by_signal
-    if place.size > 3:
-        rows = np.insert(rows, 3, terms.by_level, axis=0)
-    return terms, rows
-
-
-def slopes(
-    likelihood: Likelihood, model: SizedModel, place: FloatArray, common: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Signal of a frame, and its derivatives in (x, y, z, m) or (x, y, z, m, n)."""
-    x, y, z = place.tolist()
-    mass, *index = common.tolist()
-    if not index:
-        return model.amplitude_gradient(likelihood.grid, x, y, z, mass)
-    return slopes_with_index(model, likelihood.grid, (x, y, z), mass, index[0])
-
-
-def _scoring_step(here: _Frames) -> tuple[FloatArray, FloatArray, float]:
-    """Give the steps of c and of the places, and the gain that they are expected to bring."""
-    step = np.asarray(np.linalg.solve(here.known, here.pull), dtype=np.float64)
-    left = here.place_score - here.mixed @ step
-    moves: FloatArray = np.einsum("fij,fj->fi", here.place_inverse, left)
-    score = here.place_score
-    alone = float(np.einsum("f,fi,fij,fj->", here.shares, score, here.place_inverse, score))
-    return step, moves, 0.5 * (float(step @ here.pull) + alone)
-
-
 def _log_weight(here: _Frames, owners: IntArray) -> float:
     """Logarithm of likelihood times volume of the posterior, in places and diameter."""
     volumes = [
@@ -412,28 +416,177 @@ def _log_weight(here: _Frames, owners: IntArray) -> float:
 
 
 def _bias(
-    likelihoods: Sequence[Likelihood],
-    model: SizedModel,
-    places: tuple[FloatArray, IntArray],
-    common: FloatArray,
-    here: _Frames,
+    joint: _Joint, rows: FloatArray, owners: IntArray, common: FloatArray, here: _Frames
 ) -> FloatArray:
     """Bias of c that places which follow the noise of their frame make."""
     total = np.zeros(common.size)
     mass = float(common[0])
-    linear = _model_of(model, common).at(mass)
-    for b, (place, f) in enumerate(zip(*places, strict=True)):
-        likelihood = likelihoods[f]
-        terms, rows = _terms(likelihood, model, place, common)
-        bends = linear.derivative_rows(likelihood.grid, np.array([*place[:3], mass]))
+    linear = joint.model if common.size == 1 else joint.model.of_index(float(common[1]))
+    for b, (place, f) in enumerate(zip(rows, owners, strict=True)):
+        likelihood = joint.likelihoods[f]
+        terms, slopes = joint.terms(likelihood, place, common)
+        bends = linear.at(mass).derivative_rows(likelihood.grid, np.array([*place[:3], mass]))
         inverse, p = here.place_inverse[b], place.size
         traced = sum(
             (1 if i == j else 2) * inverse[i, j] * bends[:, 5 + pair]
             for pair, (i, j) in enumerate(PAIRS)
             if j < 3
         )
-        along = rows[p:] - np.einsum("ic,i...->c...", inverse @ here.mixed[b], rows[:p])
-        weight = here.shares[b] * terms.information * terms.by_signal
-        total += np.tensordot(along, weight * traced, axes=2)
+        along = slopes[p:] - np.einsum("ic,i...->c...", inverse @ here.mixed[b], slopes[:p])
+        total += np.tensordot(along, here.shares[b] * terms.information * traced, axes=2)
     known = here.information.sum(axis=0) + here.prior
     return np.asarray(-0.5 * np.linalg.solve(known, total))
+
+
+INDEX = 4
+"""Where the index stands in θ, before the level."""
+
+_SAME_LIKELIHOOD = 0.5  # by which a fit may end below the one that it began from
+
+
+class IndexFit(NamedTuple):
+    """A sphere whose index was fitted as well, and what its picture tells."""
+
+    likelihood: Likelihood
+    fit: FitResult
+    power: float
+    """q of d^q (n − n_s)."""
+
+    sigma: float
+    """Relative standard error of that."""
+
+    @property
+    def is_told(self) -> bool:
+        """Whether the picture tells diameter and index apart."""
+        return math.isfinite(self.fit.sigma_index)
+
+
+def fit_index(likelihood: Likelihood, fit: FitResult, z_range_nm: tuple[float, float]) -> IndexFit:
+    """Fit the index as well, from every likely diameter; the fit stays where that tells nothing."""
+    model = _model_of(likelihood)
+    found = _maxima(likelihood, model, fit, z_range_nm)
+    before = _covariance(likelihood, fit)
+    if found:
+        best, *others = found
+        own, again, covariance = _refitted(likelihood, model, fit, best, z_range_nm)
+        if _is_told(likelihood, own, fit, again, (before, covariance)):
+            again = _with_errors(again, covariance, others)
+            return IndexFit(own, again, *_combination(own, again, covariance))
+    return IndexFit(likelihood, fit, *_combination(likelihood, fit, before))
+
+
+def _model_of(likelihood: Likelihood) -> SizedModel:
+    """Give the model of a sphere's likelihood."""
+    if not isinstance(likelihood.model, SizedModel):
+        raise TypeError(f"{type(likelihood.model).__name__} has no index")
+    return likelihood.model
+
+
+def _refitted(
+    likelihood: Likelihood,
+    model: SizedModel,
+    fit: FitResult,
+    best: CommonSize,
+    z_range_nm: tuple[float, float],
+) -> tuple[Likelihood, FitResult, FloatArray]:
+    """Fit the sphere again with the index that was found, and give the covariance with the index.
+
+    Shapes: covariance (6, 6), of θ with the index.
+    """
+    own = replace(likelihood, model=model.of_index(best.index - float(best.bias[1])))
+    pixel = likelihood.grid.pixel_nm
+    x, y, z, *_ = best.places[0].tolist()
+    start = Candidate(x / pixel, y / pixel, z, best.mass_kda, fit.snr)
+    again = fit_particle(own, start, "size", z_range_nm, level=bool(fit.box.free[LEVEL]))
+    again = again.shifted(fit.x_nm - float(fit.estimate[0]), fit.y_nm - float(fit.estimate[1]))
+    return own, again, _covariance(own, again)
+
+
+def _is_told(
+    likelihood: Likelihood,
+    own: Likelihood,
+    fit: FitResult,
+    again: FitResult,
+    covariances: Sequence[FloatArray],
+) -> bool:
+    """Tell whether the index is known to better than half of its contrast.
+
+    A picture that tells little lets the index go anywhere, to where its error, by the curvature, is
+    small.  So its error where the fit began counts as well; and on the way from there the logarithm
+    of the likelihood rose by g, so that the error is no less than that way over √(2 g).
+    """
+    model = _model_of(own)
+    index, known = model.sphere.index.real, _model_of(likelihood).sphere.index.real
+    gain = again.log_likelihood - fit.log_likelihood
+    if Status.AT_BOUND in again.flags or gain < -_SAME_LIKELIHOOD:
+        return False
+    errors = [math.sqrt(covariance[INDEX, INDEX]) for covariance in covariances]
+    errors.append(abs(index - known) / math.sqrt(max(2 * gain, 1.0)))
+    return max(errors) < UNDETERMINED * abs(index - model.optics.n_sample)
+
+
+def _with_errors(fit: FitResult, covariance: FloatArray, others: Sequence[CommonSize]) -> FitResult:
+    """Give a fit the errors with the index free, and a flag for another likely diameter."""
+    errors = np.sqrt(np.diag(covariance))
+    apart = OTHER_SIZE * errors[AMPLITUDE]
+    flags = list(fit.flags)
+    if any(abs(other.mass_kda - fit.mass_kda) > apart for other in others):
+        flags.append(Status.AMBIGUOUS_SIZE)
+    status, noticed = verdict(flags)
+    return replace(
+        fit, sigma=errors[:4], sigma_index=float(errors[INDEX]), status=status, flags=noticed
+    )
+
+
+def _maxima(
+    likelihood: Likelihood, model: SizedModel, fit: FitResult, z_range_nm: tuple[float, float]
+) -> list[CommonSize]:
+    """Find the maxima of the likelihood in place, diameter and index that are likely, best first.
+
+    They begin at the diameters and heights that are likely at the configured index.
+    """
+    x, y, z, mass, level = fit.theta.tolist()
+    levels = [level] if fit.box.free[LEVEL] else []
+    starts = [(z, mass), *((other.z_nm, other.mass_kda) for other in fit.alternatives)]
+    tried = [
+        fit_common_size(
+            [likelihood], model, np.array([[x, y, height, *levels]]), z_range_nm,
+            mass_kda=size, index=model.sphere.index.real,
+        )
+        for height, size in starts
+    ]  # fmt: skip
+    found = sorted(
+        (one for one in tried if one is not None and one.converged),
+        key=lambda one: -one.log_likelihood,
+    )
+    least = found[0].log_likelihood - math.log(SURE_ODDS) if found else math.inf
+    return [one for one in found if one.log_likelihood > least]
+
+
+def _combination(
+    likelihood: Likelihood, fit: FitResult, covariance: FloatArray
+) -> tuple[float, float]:
+    """Give q of the combination d^q (n − n_s) that is told best, and its relative error.
+
+    Shapes: `covariance` (6, 6).
+    """
+    model = _model_of(likelihood)
+    both = np.ix_([AMPLITUDE, INDEX], [AMPLITUDE, INDEX])
+    scale = np.array([3 * fit.mass_kda, model.sphere.index.real - model.optics.n_sample])
+    relative = covariance[both] / np.outer(scale, scale)
+    along = np.linalg.eigh(relative)[1][:, 0]
+    told = along / along[1]
+    return float(told[0]), math.sqrt(max(float(told @ relative @ told), 0.0))
+
+
+def _covariance(likelihood: Likelihood, fit: FitResult) -> FloatArray:
+    """Give the inverse of the expected information; 0 for a height that is at an end of its range.
+
+    Shapes: result (6, 6), of θ with the index.
+    """
+    model = _model_of(likelihood)
+    theta = np.insert(fit.theta, INDEX, model.sphere.index.real)
+    fisher = likelihood.under(SphereOfIndex(model)).score_fisher(theta)[2]
+    free = np.insert(fit.box.free, INDEX, True)
+    free[2] &= fit.box.lower[2] < fit.theta[2] < fit.box.upper[2]
+    return np.nan_to_num(covariance_of(fisher, free))

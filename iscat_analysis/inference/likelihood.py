@@ -1,11 +1,12 @@
 """The likelihood of one region: value, score, Fisher and observed information, maximum.
 
-`iscat_analysis.inference.noise` makes it of counts.
+`iscat_analysis.inference.counts` makes it of counts.
 
-With a prior of the height, each of these is of likelihood × prior.
-
-Parameters are always θ = (x [nm], y [nm], z [nm], a, g): a the model's amplitude (the mass in kDa
-unless a calibration is given), g the logarithm of a common level, normally fixed at 0.
+θ has the parameters of the particle model in their order, and then g, the logarithm of a common
+level, normally fixed at 0.  `ModelLikelihood` is that of any particle; `Likelihood` is that of
+`ForwardModel`, with θ = (x [nm], y [nm], z [nm], a, g), a the model's amplitude (the mass in kDa
+unless a calibration is given), and of dipoles the compiled kernels know all of it.  With a prior of
+the height, each of its values is of likelihood × prior.
 
 The model is known for heights in its `z_range_nm` and where no pixel is farther from the particle
 than its `reach_nm`.  Outside this support, and where a parameter is not a finite number, a
@@ -19,7 +20,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iscat_analysis._kernels.curvature import observed_information
 from iscat_analysis._kernels.image import Pixels
@@ -31,45 +31,36 @@ from iscat_analysis._kernels.support import box_supported, supported
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import vector_of
 from iscat_analysis.inference.heights import HeightPrior
-from iscat_analysis.inference.noise_models import NoiseModel, PixelTerms
-from iscat_analysis.inference.slow_scoring import maximize_slowly
-from iscat_analysis.optics.forward import ForwardModel, PixelGrid
+from iscat_analysis.inference.laws import NOISE_LAWS, NoiseLaw
+from iscat_analysis.inference.maximiser import PASSES, TOLERANCE, Optimum, maximise
+from iscat_analysis.inference.models import ParticleModel
+from iscat_analysis.optics.model import ForwardModel, Parameter
+from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.optics.stamp import margin_nm
+from iscat_analysis.records import BoolArray, Box, FloatArray
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 LEVEL = 4
-"""Index of the level in θ."""
+"""Index of the level in the θ of a `Likelihood`."""
 
-_MOST_PICTURED = 128  # pixels along an axis; the table of a larger picture would not be worth it
 LARGEST_LEVEL = 50.0
 """Logarithm of the level beyond which no light is meant, and counts would overflow."""
 
-
-@dataclass(frozen=True)
-class Optimum:
-    """Where a maximisation ended."""
-
-    theta: FloatArray
-    log_likelihood: float
-    passes: int
-    converged: bool
-    fisher: FloatArray
+_MOST_PICTURED = 128  # pixels along an axis; the table of a larger picture would not be worth it
+_LEVEL = Parameter("log_level", limits=(-LARGEST_LEVEL, LARGEST_LEVEL), step=1.0)
 
 
 @dataclass(frozen=True)
-class Likelihood:
-    """One region's counts under one noise model; build it with the functions of this module."""
+class ModelLikelihood:
+    """One region's counts under one noise law, of any particle model."""
 
-    model: ForwardModel
+    model: ParticleModel
     grid: PixelGrid
-    noise: NoiseModel
+    noise: NoiseLaw
     data: FloatArray
-    prior: HeightPrior | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.noise, NoiseModel):
-            raise ConfigError(f"noise = {self.noise!r}: give one of `NOISE_MODELS`")
+        if not isinstance(self.noise, NoiseLaw) or NOISE_LAWS.get(self.noise.name) != self.noise:
+            raise ConfigError(f"noise = {self.noise!r}: give one of `NOISE_LAWS`")
         ready = isinstance(self.data, np.ndarray) and self.data.dtype == np.float64
         if not ready or self.data.shape != (4, *self.grid.shape):
             raise DataError(
@@ -81,10 +72,14 @@ class Likelihood:
         if not np.all(np.isfinite(self.data)):
             raise DataError("data: holds values that are not finite; mask those pixels")
 
-    @property
-    def height_prior(self) -> tuple[float, float]:
-        """Mean and information of the prior of z, as kernels take them."""
-        return (0.0, 0.0) if self.prior is None else (self.prior.mean_nm, self.prior.information)
+    def under(self, model: ParticleModel) -> ModelLikelihood:
+        """Likelihood of the same counts under another particle model."""
+        return ModelLikelihood(model, self.grid, self.noise, self.data)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """What θ consists of."""
+        return (*self.model.parameters, _LEVEL)
 
     @property
     def n_pixels(self) -> int:
@@ -100,17 +95,143 @@ class Likelihood:
         """Log-likelihood at many parameter vectors.
 
         Where `pictured`, images at the model's height come from a table of them, whatever their
-        pixels; it is as right as the images of fits.
+        pixels, if the particle is a dipole; it is as right as the images of fits.
 
-        Shapes: `thetas` (n, 5), result (n,).
+        Shapes: `thetas` (n, p), result (n,).
         """
+        del pictured
+        points = vector_of("thetas", thetas, (-1, len(self.parameters)))
+        return np.array([self.score_fisher(point)[0] for point in points])
+
+    def supports(self, thetas: FloatArray) -> BoolArray:
+        """Tell where the model is known.
+
+        Shapes: `thetas` (n, p), result (n,).
+        """
+        low, high = np.array([each.limits for each in self.parameters]).T
+        return np.asarray((np.isfinite(thetas) & (thetas >= low) & (thetas <= high)).all(axis=1))
+
+    def score_fisher(self, theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Log-likelihood, its gradient and the expected information.
+
+        Shapes: `theta` (p,), `score` (p,), `fisher` (p, p).
+        """
+        count = len(self.parameters)
+        point = vector_of("theta", theta, (count,))
+        nothing = -np.inf, np.full(count, np.nan), np.full((count, count), np.nan)
+        if not self.supports(point[None])[0]:
+            return nothing
+        signal, slopes = self.model.signal(self.grid, point[:-1])
+        value, score, fisher = self.score_of_signal(signal, slopes, float(point[-1]))
+        if not math.isfinite(value):
+            return nothing
+        for i, each in enumerate(self.parameters):
+            if each.prior is not None:
+                away, information = point[i] - each.prior[0], each.prior[1] ** -2
+                value -= 0.5 * information * away**2
+                score[i] -= information * away
+                fisher[i, i] += information
+        return value, score, fisher
+
+    def score_of_signal(
+        self, signal: FloatArray, slopes: FloatArray, level: float
+    ) -> tuple[float, FloatArray, FloatArray]:
+        """Log-likelihood of a signal, its gradient and the expected information.
+
+        Parameters are those of the slopes, and the level.
+
+        Shapes: `signal` (ny, nx), `slopes` (n, ny, nx), `score` (n + 1,), `fisher` (n + 1, n + 1).
+        """
+        terms = self.noise.terms(self.data, signal, level)
+        rows = np.concatenate([slopes, terms.by_level[None]]).reshape(len(slopes) + 1, -1)
+        score = rows @ terms.score.ravel()
+        return terms.value, score, (rows * terms.information.ravel()) @ rows.T
+
+    def maximize(
+        self,
+        start: FloatArray,
+        free: BoolArray,
+        lower: FloatArray,
+        upper: FloatArray,
+        *,
+        tolerance: float = TOLERANCE,
+        least: float = -math.inf,
+    ) -> Optimum:
+        """Maximise by damped Fisher scoring inside a box.
+
+        Shapes: `start, lower, upper, free` (p,).
+        """
+        theta, box = self._checked(start, free, lower, upper)
+        return maximise(
+            self.score_fisher, theta, box, self.farthest, tolerance=tolerance, least=least
+        )
+
+    def farthest(self, theta: FloatArray) -> FloatArray:
+        """Largest change of each parameter in one step from a point.
+
+        Shapes: `theta`, result (p,).
+        """
+        each_of = zip(self.parameters, np.abs(theta).tolist(), strict=True)
+        return np.array(
+            [min(one.step, one.growth * size if size else math.inf) for one, size in each_of]
+        )
+
+    def measured_signal(self) -> FloatArray:
+        """Signal that the counts show, shape (ny, nx); NaN where masked."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            out = self.noise.measured_signal(self.data)
+        return np.where(self.used, out, np.nan)
+
+    def signal_information(self, signal: FloatArray | None = None) -> FloatArray:
+        """Fisher information of each pixel about its own signal.
+
+        Shapes: `signal` (ny, nx), result (ny, nx).
+        """
+        s = np.zeros(self.grid.shape) if signal is None else signal
+        return self.noise.signal_information(self.data, s)
+
+    def _checked(
+        self, start: FloatArray, free: BoolArray, lower: FloatArray, upper: FloatArray
+    ) -> tuple[FloatArray, Box]:
+        """Check the shapes of a start and of a box, and whether one is inside the other."""
+        shape = (len(self.parameters),)
+        theta = vector_of("start", start, shape).copy()
+        lower, upper = vector_of("lower", lower, shape), vector_of("upper", upper, shape)
+        free = np.ascontiguousarray(free, dtype=np.bool_)
+        if free.shape != shape:
+            raise DataError(f"free: has shape {free.shape} where {shape} is needed")
+        if not np.all(~free | ((theta >= lower) & (theta <= upper))):
+            raise ConfigError(
+                f"start = {_listed(theta)} lies outside the box from {_listed(lower)} to "
+                f"{_listed(upper)}: clip it, or widen the box"
+            )
+        return theta, Box(free, lower, upper)
+
+
+@dataclass(frozen=True)
+class Likelihood(ModelLikelihood):
+    """One region's counts under one noise law; build it with `conditional` or `poisson`."""
+
+    model: ForwardModel
+    prior: HeightPrior | None = None
+
+    @property
+    def height_prior(self) -> tuple[float, float]:
+        """Mean and information of the prior of z, as kernels take them."""
+        return (0.0, 0.0) if self.prior is None else (self.prior.mean_nm, self.prior.information)
+
+    def values(self, thetas: FloatArray, *, pictured: bool = False) -> FloatArray:
+        """As `ModelLikelihood.values`."""
         points = vector_of("thetas", thetas, (-1, 5))
         inside = self.supports(points)
         out = np.full(len(points), -np.inf)
         if not inside.any():
             return out
         if self.model.is_sized:  # each mass has its own picture
-            out[inside] = [self._terms(point).value for point in points[inside]]
+            out[inside] = [
+                self.noise.terms(self.data, self.signal(point), float(point[LEVEL])).value
+                for point in points[inside]
+            ]
             return out
         known = points if inside.all() else points[inside]
         values = np.empty(len(known))
@@ -123,23 +244,15 @@ class Likelihood:
         return out
 
     def supports(self, thetas: FloatArray) -> BoolArray:
-        """Tell where the model is known.
-
-        Shapes: `thetas` (n, 5), result (n,).
-        """
+        """As `ModelLikelihood.supports`."""
         inside: BoolArray = supported(thetas, *self._support)
         return inside
 
     def score_fisher(self, theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Log-likelihood, its gradient and the expected information.
-
-        Shapes: `theta` (5,), `score` (5,), `fisher` (5, 5).
-        """
+        """As `ModelLikelihood.score_fisher`."""
         point = vector_of("theta", theta, (5,))
-        if not self.supports(point[None])[0]:
-            return -np.inf, np.full(5, np.nan), np.full((5, 5), np.nan)
-        if self.model.is_sized:
-            return self._score_of_sphere(point)
+        if self.model.is_sized or not self.supports(point[None])[0]:
+            return super().score_fisher(point)
         score, fisher = np.empty(5), np.empty((5, 5))
         profile = self.model.profile(point[2])
         value = score_pass(profile, *self._arguments, point, score, fisher)
@@ -154,26 +267,15 @@ class Likelihood:
         lower: FloatArray,
         upper: FloatArray,
         *,
-        tolerance: float = 2e-4,
-        passes: int = 60,
+        tolerance: float = TOLERANCE,
+        passes: int = PASSES,
         least: float = -math.inf,
     ) -> Optimum:
-        """Maximise by damped Fisher scoring inside a box.
-
-        Shapes: `start, lower, upper` (5,), `free` (5,).
-        """
-        theta = vector_of("start", start, (5,)).copy()
-        lower, upper = vector_of("lower", lower, (5,)), vector_of("upper", upper, (5,))
-        free = np.ascontiguousarray(free, dtype=np.bool_)
-        if free.shape != (5,):
-            raise DataError(f"free: has shape {free.shape} where (5,) is needed")
-        self._require_box(theta, free, lower, upper)
+        """As `ModelLikelihood.maximize`; a box that leaves the support is refused."""
         if self.model.is_sized:
-            found = maximize_slowly(
-                self.score_fisher, theta, free, lower, upper, self._farthest,
-                tolerance=tolerance, passes=passes, least=least,
-            )  # fmt: skip
-            return Optimum(*found)
+            return super().maximize(start, free, lower, upper, tolerance=tolerance, least=least)
+        theta, box = self._checked(start, free, lower, upper)
+        free, lower, upper = box.free, box.lower, box.upper
         fisher = np.empty((5, 5))
         lens, pixels, kind, data = self._arguments
         if free[2]:
@@ -184,7 +286,7 @@ class Likelihood:
             table = self.model.height_table(theta[2])
         value, used, outcome = maximize(
             tuple(table), tuple(lens), tuple(pixels), kind, data, free, lower, upper,
-            self._farthest, tolerance, passes, theta, fisher, least, self.height_prior,
+            self.farthest(np.zeros(5)), tolerance, passes, theta, fisher, least, self.height_prior,
         )  # fmt: skip
         return Optimum(theta, value, used, outcome == CONVERGED, fisher)
 
@@ -223,35 +325,6 @@ class Likelihood:
         height = "exact" if free is None else "between" if free[2] else "fixed"
         return self.model.derivative_rows(self.grid, self._supported(theta), height)
 
-    def _terms(self, point: FloatArray) -> PixelTerms:
-        """Value, score and information of the pixels at θ."""
-        x, y, z, amplitude, level = (float(value) for value in point)
-        signal = self.model.amplitude_image(self.grid, x, y, z, amplitude)
-        return self.noise.terms(self.data, signal, level)
-
-    def _score_of_sphere(self, point: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """`score_fisher` of a model whose picture is not proportional to the amplitude."""
-        x, y, z, amplitude, level = (float(value) for value in point)
-        signal, own = self.model.amplitude_gradient(self.grid, x, y, z, amplitude)
-        return self.score_of_signal(signal, own, level)
-
-    def score_of_signal(
-        self, signal: FloatArray, slopes: FloatArray, level: float
-    ) -> tuple[float, FloatArray, FloatArray]:
-        """Log-likelihood of a signal, its gradient and the expected information.
-
-        Parameters are those of the slopes, with the level at its place in θ.
-
-        Shapes: `signal` (ny, nx), `slopes` (n, ny, nx), `score` (n + 1,), `fisher` (n + 1, n + 1).
-        """
-        terms, count = self.noise.terms(self.data, signal, level), len(slopes) + 1
-        if not math.isfinite(terms.value):
-            return -np.inf, np.full(count, np.nan), np.full((count, count), np.nan)
-        rows = np.insert(slopes * terms.by_signal, LEVEL, terms.by_level, axis=0)
-        rows = rows.reshape(count, -1)
-        score = rows @ terms.score.ravel()
-        return terms.value, score, (rows * terms.information.ravel()) @ rows.T
-
     def observed_information(self, theta: FloatArray) -> FloatArray:
         """Negative Hessian of the log-likelihood.
 
@@ -263,35 +336,16 @@ class Likelihood:
         return info
 
     def residuals(self, theta: FloatArray) -> FloatArray:
-        """Give data minus model in standard deviations.
+        """Give data minus model in standard deviations; NaN where masked.
 
         Shapes: `theta` (5,), result (ny, nx).
         """
-        signal, level = self.signal(theta), float(np.exp(theta[LEVEL]))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            out = self.noise.residuals(self.data, signal, level)
-        return np.where(self.used, out, np.nan)
+        return self.noise.residuals(self.data, self.signal(theta), math.exp(theta[LEVEL]))
 
     def signal(self, theta: FloatArray) -> FloatArray:
         """Signal of the model at θ, which must lie in the support; shape (ny, nx)."""
-        x, y, z, amplitude, _ = (float(value) for value in self._supported(theta))
+        x, y, z, amplitude, _ = self._supported(theta).tolist()
         return self.model.amplitude_image(self.grid, x, y, z, amplitude)
-
-    def measured_signal(self) -> FloatArray:
-        """Signal that the counts show, shape (ny, nx); NaN where masked."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            out = self.noise.measured_signal(self.data)
-        return np.where(self.used, out, np.nan)
-
-    def signal_information(self, signal: FloatArray | None = None) -> FloatArray:
-        """Fisher information of each pixel about its own signal.
-
-        Shapes: `signal` (ny, nx), result (ny, nx).
-        """
-        s = np.zeros(self.grid.shape) if signal is None else signal
-        with np.errstate(divide="ignore", invalid="ignore"):
-            out = self.noise.signal_information(self.data, s)
-        return np.where(self.used, out, 0.0)
 
     def _supported(self, theta: FloatArray) -> FloatArray:
         """Return θ, unless the model is not known there."""
@@ -303,21 +357,17 @@ class Likelihood:
             )
         return point
 
-    def _require_box(
+    def _checked(
         self, start: FloatArray, free: BoolArray, lower: FloatArray, upper: FloatArray
-    ) -> None:
-        """Refuse a box that a fit could leave the support in."""
-        inside, known = box_supported(start, free, lower, upper, *self._support)
-        if not inside:
+    ) -> tuple[FloatArray, Box]:
+        """Refuse a box that a fit could leave the support in as well."""
+        theta, box = super()._checked(start, free, lower, upper)
+        if not box_supported(theta, box.free, box.lower, box.upper, *self._support)[1]:
             raise ConfigError(
-                f"start = {_listed(start)} lies outside the box from {_listed(lower)} to "
-                f"{_listed(upper)}: clip it, or widen the box"
+                f"lower = {_listed(box.lower)}, upper = {_listed(box.upper)}: {self._supports()}; "
+                "narrow the box or give forward_model a larger reach_nm or z_max_nm"
             )
-        if not known:
-            raise ConfigError(
-                f"lower = {_listed(lower)}, upper = {_listed(upper)}: {self._supports()}; narrow "
-                "the box or give forward_model a larger reach_nm or z_max_nm"
-            )
+        return theta, box
 
     def is_pictured(self, z_nm: float, lower: FloatArray, upper: FloatArray) -> bool:
         """Whether a table of the picture at the model's height serves all places in a box.
@@ -355,12 +405,6 @@ class Likelihood:
         grid, model = self.grid, self.model
         half = grid.pixel_nm / 2
         return grid.x_nm, grid.y_nm, half, model.reach_nm, *model.z_range_nm, LARGEST_LEVEL
-
-    @cached_property
-    def _farthest(self) -> FloatArray:
-        """Largest change of each parameter in one step."""
-        wavelength = self.model.optics.wavelength_nm
-        return np.array([0.25 * wavelength, 0.25 * wavelength, 0.1 * wavelength, np.inf, 1.0])
 
     @cached_property
     def _arguments(self) -> tuple[Lens, Pixels, int, FloatArray]:

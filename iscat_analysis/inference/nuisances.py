@@ -5,6 +5,15 @@ has a derivative of the image: ∂s/∂z; and ½ Σ·∇∇s for a particle whos
 of covariance Σ, because it wiggles or has parts that are apart.  With u the score along them and I
 their information once everything that was fitted follows, I⁻¹u estimates them, and uᵀI⁻¹u tests
 whether they are there (Rao's score test; C. R. Rao, Proc. Camb. Phil. Soc. 44, 50, 1948).
+
+A particle of two equal halves: its mass, and the distance and direction of the halves.
+
+For small h the image of `Halves` is s + ½ hhᵀ·∇∇s, s that of a point: a covariance of places of one
+direction, which starts the fit.  ±h are one particle.
+
+Twice the gain in log-likelihood over a point tests for two halves.  Pairs are special cases of a
+covariance of places, which has three parameters, so that by chance the gain is at most χ² of three
+degrees of freedom.
 """
 
 from __future__ import annotations
@@ -13,9 +22,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import chdtrc
 
+from iscat_analysis.inference.fit import fit_model, goodness_of_fit
+from iscat_analysis.inference.laws import PixelTerms
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
-from iscat_analysis.records import FitResult, FloatArray
+from iscat_analysis.inference.models import FARTHEST_HALF_NM, Halves
+from iscat_analysis.records import Box, FitResult, FloatArray
 
 Z, MASS = 2, 3
 """Where height and amplitude stand in θ."""
@@ -71,11 +84,13 @@ def evidence_of(likelihood: Likelihood, fit: FitResult, rise: int = 0) -> FloatA
     if likelihood.model.is_measured or likelihood.model.is_sized or not free[MASS]:
         return np.array(NOTHING)
     rows = np.moveaxis(likelihood.derivatives(theta), 1, 0)
-    pull, bend, of_level = _slopes(likelihood, rows[0], math.exp(theta[LEVEL]))
-    axes = [*rows[1:5], of_level]
+    terms = likelihood.noise.terms(likelihood.data, rows[0], float(theta[LEVEL]))
+    if not math.isfinite(terms.value):
+        return np.array(NOTHING)
+    axes = [*rows[1:5], terms.by_level]
     fitted = [i for i in range(5) if free[i] and i != Z]
     slope = likelihood.model.scale.slope(float(theta[MASS]))
-    lifted = _beside(pull, bend, [axes[i] for i in fitted], [axes[Z]])
+    lifted = _beside(terms, [axes[i] for i in fitted], [axes[Z]])
     if lifted is None:
         return np.array(NOTHING)
     (up,), ((known,),), follow = lifted
@@ -85,7 +100,7 @@ def evidence_of(likelihood: Likelihood, fit: FitResult, rise: int = 0) -> FloatA
     round_ = (rows[_XX] + rows[_YY]) / 2
     across = (rows[_XX] - rows[_YY]) / 2
     spread = _beside(
-        pull, bend, [axes[i] for i in fitted], [round_, across, rows[_XY]],
+        terms, [axes[i] for i in fitted], [round_, across, rows[_XY]],
         known={fitted.index(Z): likelihood.height_prior} if free[Z] else {}, at_nm=theta[Z],
     )  # fmt: skip
     if spread is None:
@@ -98,26 +113,8 @@ def evidence_of(likelihood: Likelihood, fit: FitResult, rise: int = 0) -> FloatA
     return np.array([*own, *wide, chi2, *(two @ up_[1:]), error, rise])
 
 
-def _slopes(
-    likelihood: Likelihood, signal: FloatArray, level: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Give ∂ℓ/∂s, the information about s, and ∂s/∂g of every pixel.
-
-    Shapes: `signal` (ny, nx), results (ny, nx).
-    """
-    terms = likelihood.noise.terms(likelihood.data, signal, math.log(level))
-    by_signal = terms.by_signal
-    if not np.isfinite(terms.value):
-        return by_signal, by_signal, by_signal  # which are 0 for an impossible signal
-    follow = np.divide(
-        terms.by_level, by_signal, out=np.zeros_like(by_signal), where=by_signal != 0
-    )
-    return terms.score * by_signal, terms.information * by_signal**2, follow
-
-
 def _beside(
-    pull: FloatArray,
-    bend: FloatArray,
+    terms: PixelTerms,
     fitted: list[FloatArray],
     extra: list[FloatArray],
     *,
@@ -128,11 +125,11 @@ def _beside(
 
     `known` holds mean and information of a prior of a fitted one, which is at `at_nm`.
 
-    Shapes: `pull, bend` (ny, nx), results (k,), (k, k), (k, n).
+    Shapes: results (k,), (k, k), (k, n).
     """
     all_ = np.array([*fitted, *extra]).reshape(len(fitted) + len(extra), -1)
-    n, b = len(fitted), bend.ravel()
-    score, fisher = all_ @ pull.ravel(), (all_ * b) @ all_.T
+    n = len(fitted)
+    score, fisher = all_ @ terms.score.ravel(), (all_ * terms.information.ravel()) @ all_.T
     for index, (mean, information) in (known or {}).items():
         score[index] -= information * (at_nm - mean)
         fisher[index, index] += information
@@ -155,3 +152,77 @@ def _beside(
 
 _DEPENDENT = 1e-6
 """Share of a direction's information that is left, below which the fit has it already."""
+
+
+_SHORTEST_NM = 20.0  # at which the fit starts: at 0 the derivative along h vanishes
+
+
+class Pair(NamedTuple):
+    """The fit of two halves, in columns of ``fits.csv``.
+
+    Attributes
+    ----------
+    pair_mass_kda, separation_nm, angle_deg : float
+        Mass of both, their distance, and its direction from x towards y, 0 to 180°.
+    sigma_pair_mass_kda, sigma_separation_nm, sigma_angle_deg : float
+        Errors from the Fisher information, which are the Cramér–Rao bounds too.
+    p_point : float
+        Probability that a point gains as much by chance.
+    pair_chi2_reduced, pair_p_value : float
+        Goodness of fit.
+    """
+
+    pair_mass_kda: float = math.nan
+    sigma_pair_mass_kda: float = math.nan
+    separation_nm: float = math.nan
+    sigma_separation_nm: float = math.nan
+    angle_deg: float = math.nan
+    sigma_angle_deg: float = math.nan
+    p_point: float = math.nan
+    pair_chi2_reduced: float = math.nan
+    pair_p_value: float = math.nan
+
+
+def pair_of(likelihood: Likelihood, fit: FitResult, evidence: Evidence) -> Pair:
+    """Fit two halves beside a point; all is NaN where the fit does not converge.
+
+    `evidence` has the width and elongation of the image beside the fit of a point.
+    """
+    wide, across, along = evidence.spread_nm2, evidence.across_nm2, evidence.along_nm2
+    covariance_nm2 = np.array([[wide + across, along], [along, wide - across]])
+    if not np.isfinite(covariance_nm2).all():
+        return Pair()
+    size, direction = np.linalg.eigh(covariance_nm2)
+    half = direction[:, -1] * max(math.sqrt(max(size[-1], 0.0)), _SHORTEST_NM)
+    half *= min(1.0, 0.8 * FARTHEST_HALF_NM / math.hypot(*half))
+    halves, far = Halves(likelihood.model), np.full(2, FARTHEST_HALF_NM)
+    free = np.insert(fit.box.free, LEVEL, [True, True])
+    free[Z] = False
+    both = likelihood.under(halves)
+    box = Box(free, np.insert(fit.box.lower, LEVEL, -far), np.insert(fit.box.upper, LEVEL, far))
+    found = fit_model(both, np.insert(fit.theta, LEVEL, half), box)
+    if not found.converged:
+        return Pair()
+    theta, covariance = found.theta, found.covariance
+    apart = math.hypot(theta[4], theta[5])
+    along = theta[4:6] / apart
+    sigma_along, sigma_across = (
+        math.sqrt(unit @ covariance[4:6, 4:6] @ unit) for unit in (along, along[::-1] * [-1, 1])
+    )
+    mass = halves.parameters[MASS]
+    point = both.score_fisher(np.insert(fit.theta, LEVEL, [0.0, 0.0]))[0]
+    rows, _ = halves.rows(likelihood.grid, theta)
+    chi2, p_value = goodness_of_fit(
+        likelihood, np.delete(theta, [4, 5]), np.delete(free, [4, 5]), rows
+    )
+    return Pair(
+        pair_mass_kda=float(mass.reported(theta[MASS])),
+        separation_nm=2 * apart,
+        angle_deg=math.degrees(math.atan2(theta[5], theta[4])) % 180,
+        sigma_pair_mass_kda=math.sqrt(covariance[MASS, MASS]) * abs(mass.slope(float(theta[MASS]))),
+        sigma_separation_nm=2 * sigma_along,
+        sigma_angle_deg=math.degrees(sigma_across / apart),
+        p_point=float(chdtrc(3, max(2 * (found.log_likelihood - point), 0.0))),
+        pair_chi2_reduced=chi2,
+        pair_p_value=p_value,
+    )

@@ -1,4 +1,11 @@
-"""The posterior of one particle, sampled with emcee on the likelihood that was maximised.
+"""What is known of a particle before it is seen, and the bound that this gives.
+
+A normal prior on the mass (a species) or the height (a membrane) narrows a posterior below the
+Cramér–Rao bound, which speaks of estimators without any prior.  The bound that holds is van
+Trees': the Fisher information of the data, averaged over the prior, plus that of the prior
+(H. L. Van Trees, *Detection, Estimation, and Modulation Theory* I (1968), section 2.4).
+
+The posterior of one particle, sampled with emcee on the likelihood that was maximised.
 
 The prior is flat inside the box that the fit searched, or normal in mass or height.  Half of the
 moves propose from a mixture of Student t distributions around the optima, which decorrelate in a
@@ -10,21 +17,103 @@ hold or its budget ends, and is then refused.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.prior import Prior, posterior_bound
-from iscat_analysis.records import PARAMETERS, FitResult, FloatArray, PosteriorResult
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.fit import ModelFit
+from iscat_analysis.inference.likelihood import Likelihood, ModelLikelihood
+from iscat_analysis.optics.model import Parameter
+from iscat_analysis.records import FitResult, FloatArray, PosteriorResult
 
 if TYPE_CHECKING:
     import emcee
+
+NODES = 5
+"""Gauss–Hermite nodes of each prior, over which the Fisher information is averaged."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Independent normal distributions of some parameters; flat in the others."""
+
+    normal: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def log_density(self, thetas: FloatArray, parameters: Sequence[Parameter]) -> FloatArray:
+        """Logarithm of the density, up to a constant.
+
+        Shapes: `thetas` (n, p), result (n,).
+        """
+        total = np.zeros(len(thetas))
+        for each, value in zip(parameters, thetas.T, strict=True):
+            if each.name in self.normal:
+                mean, width = self.normal[each.name]
+                if each.scale is not None:
+                    total += np.log(np.maximum(np.abs(each.scale.slopes(value)), 1e-300))
+                total -= 0.5 * ((each.reported(value) - mean) / width) ** 2
+        return total
+
+    def steps(self, parameters: Sequence[Parameter]) -> dict[int, tuple[float, float]]:
+        """Give mean and standard deviation in θ: of the amplitude in place of the mass."""
+        found = {}
+        for index, each in enumerate(parameters):
+            if each.name in self.normal:
+                mean, width = self.normal[each.name]
+                mean = each.fitted(mean)
+                found[index] = (mean, width / abs(each.slope(mean)))
+        return found
+
+
+def van_trees(information: FloatArray, prior: FloatArray) -> FloatArray:
+    """Bound on the error of any estimator, biased ones too, when there is prior knowledge.
+
+    Notes
+    -----
+    H. L. Van Trees, *Detection, Estimation, and Modulation Theory* I (1968), section 2.4.
+
+    Shapes: `information` (k, k), `prior` (k, k), result (k,).
+    """
+    total = np.asarray(information, dtype=float) + np.asarray(prior, dtype=float)
+    values, vectors = np.linalg.eigh(total)
+    if not values[0] > 1e-14 * max(values[-1], 1e-300):
+        raise ConfigError("neither the data nor the prior determine every parameter")
+    bound: FloatArray = np.sqrt(np.sum(vectors**2 / values, axis=1))
+    return bound
+
+
+def posterior_bound(
+    likelihood: ModelLikelihood, theta: FloatArray, index: NDArray[np.intp], prior: Prior
+) -> FloatArray:
+    """Van Trees bound of one particle of which some parameters have a normal prior.
+
+    Shapes: `theta` (p,), `index` (k,), result (k,).
+    """
+    parameters = likelihood.parameters
+    normal = {k: v for k, v in prior.steps(parameters).items() if k in index}
+    points, weights = np.polynomial.hermite_e.hermegauss(NODES)
+    average = np.zeros((index.size, index.size))
+    for chosen in product(range(NODES), repeat=len(normal)):
+        at = np.array(theta, dtype=float)
+        weight = 1.0
+        for node, (k, (mean, width)) in zip(chosen, normal.items(), strict=True):
+            at[k] = mean + width * points[node]
+            at[k] = np.clip(at[k], *parameters[k].limits)  # no height lies inside the glass
+            weight *= weights[node] / math.sqrt(2 * math.pi)
+        average += weight * likelihood.score_fisher(at)[2][np.ix_(index, index)]
+    known = np.array([normal[k][1] ** -2 if k in normal else 0.0 for k in index])
+    unit = 1 / np.sqrt(np.diag(average) + known)  # so that no unit is much larger than another
+    bound: FloatArray = unit * van_trees(average * np.outer(unit, unit), np.diag(known * unit**2))
+    means = np.array([normal[k][0] if k in normal else theta[k] for k in index])
+    slopes = [parameters[k].slope(float(mean)) for k, mean in zip(index, means, strict=True)]
+    return np.asarray(bound * np.abs(slopes))
+
 
 MAX_R_HAT = 1.01
 MIN_ESS = 400.0
@@ -39,8 +128,8 @@ _PROPOSAL_SCALE = 1.2  # its scale over the posterior's
 
 
 def sample_posterior(
-    likelihood: Likelihood,
-    fit: FitResult,
+    likelihood: ModelLikelihood,
+    fit: FitResult | ModelFit,
     *,
     walkers: int = 32,
     steps: int = 2000,
@@ -48,20 +137,14 @@ def sample_posterior(
     prior: Prior | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> PosteriorResult:
-    """Sample the posterior of a fitted particle."""
+    """Sample the posterior of a fitted particle, of any model."""
     import emcee  # takes a third of a second, and only chains need it
 
-    index = np.flatnonzero(fit.box.free)
-    physical = index < len(PARAMETERS)
-    normal = (
-        {}
-        if prior is None
-        else {
-            name: prior.normal[name]
-            for i in index[physical]
-            if (name := PARAMETERS[i]) in prior.normal
-        }
-    )  # of what is not free nothing can be learned
+    index, parameters = np.flatnonzero(fit.box.free), likelihood.parameters
+    names = [parameters[i].name for i in index]
+    physical = index < len(parameters) - 1
+    known = {} if prior is None else prior.normal
+    normal = {name: known[name] for name in names if name in known}  # what is free can be learned
     prior = Prior(normal)
     proposal = _Proposal.around(likelihood, fit, index, prior)
     lower, upper = fit.box.lower[index], fit.box.upper[index]
@@ -73,7 +156,7 @@ def sample_posterior(
         thetas[:, index] = points[inside]
         out[inside] = likelihood.values(thetas, pictured=True)
         if normal:
-            out[inside] += prior.log_density(thetas, likelihood.model.scale)
+            out[inside] += prior.log_density(thetas, parameters)
         return out
 
     random = np.random.RandomState(np.random.SeedSequence(seed).generate_state(8))
@@ -100,13 +183,12 @@ def sample_posterior(
     if normal:  # what is kept is the likelihood
         thetas = np.tile(fit.theta, (values.size, 1))
         thetas[:, index] = samples.reshape(values.size, -1)
-        values = values - prior.log_density(thetas, likelihood.model.scale).reshape(values.shape)
-    amplitude = np.flatnonzero(index == 3)
-    for column in amplitude:
-        samples[..., column] = likelihood.model.scale.mass(samples[..., column])
+        values = values - prior.log_density(thetas, parameters).reshape(values.shape)
+    for column, i in enumerate(index):
+        samples[..., column] = parameters[i].reported(samples[..., column])
     # the level of the light, where it is free, says nothing of the particle: it is integrated over
     return PosteriorResult(
-        names=tuple(PARAMETERS[i] for i in index[physical]),
+        names=tuple(np.array(names)[physical].tolist()),
         samples=samples[..., physical],
         log_likelihood=values,
         tau=verdict.tau[physical],
@@ -133,11 +215,15 @@ class _Proposal:
 
     @classmethod
     def around(
-        cls, likelihood: Likelihood, fit: FitResult, index: NDArray[np.intp], prior: Prior
+        cls,
+        likelihood: ModelLikelihood,
+        fit: FitResult | ModelFit,
+        index: NDArray[np.intp],
+        prior: Prior,
     ) -> _Proposal:
         """Build it from the fit's covariance, its alternative heights and the prior."""
         fisher = likelihood.score_fisher(fit.theta)[2][np.ix_(index, index)]
-        steps = prior.steps(likelihood.model.scale)
+        steps = prior.steps(likelihood.parameters)
         known = np.diag([steps[k][1] ** -2 if k in steps else 0.0 for k in index])
         wanted = np.array([steps[k][0] if k in steps else 0.0 for k in index])
         fisher = fisher + known
@@ -150,7 +236,7 @@ class _Proposal:
             if other.log_likelihood_gap < 15:
                 theta = np.array(fit.theta)
                 theta[2] = other.z_nm
-                if likelihood.model.is_sized:
+                if isinstance(likelihood, Likelihood) and likelihood.model.is_sized:
                     theta[3] = other.mass_kda
                 centres.append(theta[index])
                 gaps.append(other.log_likelihood_gap)

@@ -18,17 +18,17 @@ from typing import NamedTuple
 import numpy as np
 
 from iscat_analysis.inference.fit import AMPLITUDE, POOR_FIT_P, fit_particle, search_box
-from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood
+from iscat_analysis.inference.maximiser import Optimum, covariance_of
+from iscat_analysis.inference.models import SphereOfIndex, SphereOfLight
 from iscat_analysis.inference.sizes import (
     OTHER_SIZE,
     OTHER_SIZE_SHARE,
     SURE_ODDS,
     highest_maxima,
     scanned_masses,
-    slopes_with_index,
 )
-from iscat_analysis.inference.slow_scoring import maximize_slowly
-from iscat_analysis.optics.seated import SeatedModel, largest_dipole_nm
+from iscat_analysis.optics.sized import SeatedModel, largest_dipole_nm
 from iscat_analysis.records import (
     Alternative,
     Box,
@@ -50,7 +50,6 @@ _FOLLOWED = 3  # maxima of the likelihood over the diameter, of each material
 _STRENGTHS = np.geomspace(0.007, 0.25, 10)  # light per volume of a sphere whose index is fitted
 _REACHES_NM = (900.0, 700.0, 600.0, 500.0)  # around an image's centre, which each improves
 _BESIDE_NM = 100.0  # from it, within which a dipole is in the middle
-_TOLERANCE, _PASSES = 2e-4, 60  # as `Likelihood.maximize`
 
 
 class _Sphere(NamedTuple):
@@ -75,10 +74,8 @@ class _Sphere(NamedTuple):
     @property
     def _sigma_kda(self) -> float:
         """Standard error of the mass."""
-        free = np.flatnonzero(np.diag(self.information) > 0)
-        free = free[free != 2]  # the gap is held
-        inverse = np.linalg.pinv(self.information[np.ix_(free, free)], hermitian=True)
-        return math.sqrt(max(float(inverse[2, 2]), 0.0))
+        free = np.arange(len(self.information)) != 2  # the gap is held
+        return math.sqrt(max(float(covariance_of(self.information, free)[3, 3]), 0.0))
 
 
 def may_be_large(likelihood: Likelihood, fit: FitResult) -> bool:
@@ -160,14 +157,9 @@ def fit_seated(
     fit = fit_particle(seated, start, "mass", seated.model.z_range_nm, level=level)
     flags = [*fit.flags, Status.LARGE]
     if information is not None:  # which depends on the error of the index as well
-        free = np.append(fit.box.free, True)
-        try:
-            variance = np.diag(np.linalg.inv(information[np.ix_(free, free)]))
-        except np.linalg.LinAlgError:
-            variance = np.full(int(free.sum()), np.nan)
-        sigma = np.full(6, np.nan)
-        sigma[free] = np.sqrt(variance)
-        fit = replace(fit, sigma=sigma[:4], sigma_index=float(sigma[5]))
+        free = np.insert(fit.box.free, LEVEL, True)
+        *sigma, of_index, _ = np.sqrt(np.diag(covariance_of(information, free)))
+        fit = replace(fit, sigma=np.array(sigma), sigma_index=float(of_index))
         low, high = model_of(seated).indices
         index = model_of(seated).sphere.index.real
         if min(index - low, high - index) < 1e-6:
@@ -263,39 +255,22 @@ def _box(seated: Likelihood, theta: FloatArray, *, level: bool) -> Box:
 
 
 def _with_index(seated: Likelihood, theta: FloatArray, least: float, *, level: bool) -> _Sphere:
-    """Maximise over the index too.
-
-    The image determines the light of a sphere well and its diameter less well.  The last parameter
-    is therefore the light of a small sphere, which is constant along the ridge of the likelihood.
-    """
+    """Maximise over the index too."""
     model, box = model_of(seated), _box(seated, theta, level=level)
-    low, high = model.indices
-
-    def index_of(point: FloatArray) -> float:
-        return min(max(model.index_of(point[5] / point[AMPLITUDE]), low), high)
-
-    def along_index(point: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Log-likelihood, score and information in θ and the index."""
-        x, y, gap, mass, g = (float(value) for value in point[:5])
-        signal, slopes = slopes_with_index(model, seated.grid, (x, y, gap), mass, index_of(point))
-        return seated.score_of_signal(signal, slopes, g)
-
-    def score_fisher(point: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Log-likelihood, score and information in θ and the light."""
-        mass, strength = float(point[AMPLITUDE]), float(point[5] / point[AMPLITUDE])
-        change = np.eye(6)
-        change[5, [AMPLITUDE, 5]] = model.index_slope(strength) / mass * np.array([-strength, 1.0])
-        value, score, fisher = along_index(point)
-        return value, score @ change, change.T @ fisher @ change
-
+    spheres = SphereOfLight(model)
     light = float(theta[AMPLITUDE]) * model.strength_of(model.sphere.index.real)
-    lower, upper = np.append(box.lower, 0.0), np.append(box.upper, np.inf)
-    quarter = model.optics.wavelength_nm / 4
-    farthest = np.array([quarter, quarter, np.inf, np.inf, 1.0, np.inf])
-    end, value, passes, converged, _ = maximize_slowly(
-        score_fisher, np.clip(np.append(theta, light), lower, upper), np.append(box.free, True),
-        lower, upper, farthest, tolerance=_TOLERANCE, passes=_PASSES, least=least,
+    lower, upper = np.insert(box.lower, LEVEL, 0.0), np.insert(box.upper, LEVEL, np.inf)
+    end = seated.under(spheres).maximize(
+        np.clip(np.insert(theta, LEVEL, light), lower, upper),
+        np.insert(box.free, LEVEL, True), lower, upper, least=least,
     )  # fmt: skip
-    information = along_index(end)[2]
-    optimum = Optimum(end[:5], value, passes, converged, information[:5, :5])
-    return _Sphere(replace(seated, model=model.of_index(index_of(end))), optimum, information)
+    found = spheres.with_index(end.theta)
+    information = seated.under(SphereOfIndex(model)).score_fisher(np.append(found, end.theta[-1]))[
+        2
+    ]
+    own = np.delete(np.arange(6), LEVEL)
+    return _Sphere(
+        replace(seated, model=model.of_index(float(found[LEVEL]))),
+        replace(end, theta=np.delete(end.theta, LEVEL), fisher=information[np.ix_(own, own)]),
+        information,
+    )

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import generate_binary_structure, maximum_filter
 from scipy.special import ndtr
 
-from iscat_analysis.inference.likelihood import Likelihood, Optimum
-from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.maximiser import Optimum
 from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.records import Alternative, Box
 
@@ -43,7 +43,6 @@ OTHER_SIZE_SHARE = 0.02
 """Share of the mass by which two maxima at one height differ at least."""
 
 _FOLLOWED = 6  # local maxima that are followed
-_INDEX_STEP = 1e-4  # of differences along the index; their error is 1e-6 of the derivative
 
 
 def size_starts(
@@ -73,25 +72,6 @@ def highest_maxima(
     highest = maximum_filter(known, footprint=neighbours, mode="constant", cval=-np.inf)
     peaks = np.argwhere(np.isfinite(values) & (values >= highest)).tolist()
     return sorted(map(tuple, peaks), key=lambda at: -values[at])[:most]
-
-
-def slopes_with_index(
-    model: SizedModel,
-    grid: PixelGrid,
-    place: tuple[float, float, float],
-    mass_kda: float,
-    index: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Signal of a sphere of an index, and its derivatives in (x, y, z, m, n).
-
-    Shapes: results (ny, nx), (5, ny, nx).
-    """
-    at = grid, *place, mass_kda
-    signal, own = model.of_index(index).amplitude_gradient(*at)
-    below, above = (
-        model.of_index(index + step).amplitude_image(*at) for step in (-_INDEX_STEP, _INDEX_STEP)
-    )
-    return signal, np.concatenate([own, (above - below)[None] / (2 * _INDEX_STEP)])
 
 
 def scan_sizes(

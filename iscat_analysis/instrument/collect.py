@@ -23,13 +23,11 @@ from iscat_analysis.fitting.ranges import (
     frame_ranges,
     measured_windows,
 )
-from iscat_analysis.inference.counts import choose_noise, counts_likelihood
+from iscat_analysis.inference.counts import choose_noise, conditional, counts_likelihood, poisson
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise import conditional, poisson
 from iscat_analysis.instrument.microscope import RINGS_NM, TESTED, build_microscope
 from iscat_analysis.instrument.particle_image import PRIVATE, ParticleImage
 from iscat_analysis.movie import Stack
-from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.parameters import (
     FAINTEST,
@@ -38,6 +36,7 @@ from iscat_analysis.optics.parameters import (
     heights_free,
     settings_of,
 )
+from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.records import FloatArray, Windows
 from iscat_analysis.search.bright import (
     ALONE_NM,

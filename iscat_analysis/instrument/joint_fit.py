@@ -381,12 +381,11 @@ def _scores(
             for base, weight in image.slopes(name).items()
         )
     rows[k : k + LEVEL] = own.reshape(LEVEL, -1)
-    value, residual, weight, of_signal, of_level = image.noise.terms(image.data, signal, level)
-    rows[:-1] *= of_signal.ravel()
-    rows[-1] = of_level.ravel()
-    weighted = rows * weight.ravel()
-    scored = rows * residual.ravel()
-    return value + image.baseline, scored.sum(axis=1), weighted @ rows.T, scored @ scored.T
+    terms = image.noise.terms(image.data, signal, level)
+    rows[-1] = terms.by_level.ravel()
+    weighted = rows * terms.information.ravel()
+    scored = rows * terms.score.ravel()
+    return terms.value + image.baseline, scored.sum(axis=1), weighted @ rows.T, scored @ scored.T
 
 
 _NEIGHBOUR_PASSES = 6

@@ -53,7 +53,7 @@ from iscat_analysis.instrument.uneven import (
     in_uneven_field,
 )
 from iscat_analysis.movie import Stack
-from iscat_analysis.optics.field_map import terms_of
+from iscat_analysis.optics.local import terms_of
 from iscat_analysis.optics.parameters import (
     FIELD,
     FREE,

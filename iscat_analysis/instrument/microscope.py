@@ -11,7 +11,7 @@ import numpy as np
 
 from iscat_analysis.config import Config, refuse_rod
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.inference.goodness import goodness_of_fit
+from iscat_analysis.inference.fit import goodness_of_fit
 from iscat_analysis.inference.heights import height_prior
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.instrument.joint_fit import Neighbours, maximise
@@ -20,8 +20,8 @@ from iscat_analysis.instrument.particle_image import (
     average_particle_images,
     with_masses,
 )
+from iscat_analysis.last_used import memoize
 from iscat_analysis.optics.forward import ForwardModel, forward_model
-from iscat_analysis.optics.memoize import memoize
 from iscat_analysis.optics.parameters import Settings, heights_free, settings_of, with_settings
 from iscat_analysis.records import Mapper
 

@@ -9,12 +9,12 @@ from typing import Any, Protocol
 import numpy as np
 from scipy import ndimage
 
+from iscat_analysis.inference.laws import CONDITIONAL, NoiseLaw
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise_models import CONDITIONAL, NoiseModel
-from iscat_analysis.optics.field_map import WEIGHTS, Spot, changes_at
 from iscat_analysis.optics.forward import ForwardModel, peak_per_amplitude
-from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.optics.local import WEIGHTS, Spot, changes_at
 from iscat_analysis.optics.parameters import FOCUS_STEP, Settings
+from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.records import BoolArray, FloatArray
 
 PRIVATE = 5
@@ -59,7 +59,7 @@ class ParticleImage:
     """The picture of one particle: counts of a region, and where the search begins."""
 
     grid: PixelGrid
-    noise: NoiseModel
+    noise: NoiseLaw
     data: FloatArray
     x_nm: float
     y_nm: float
@@ -178,8 +178,7 @@ def contrast_of(image: ParticleImage) -> tuple[FloatArray, FloatArray]:
 
     Shapes: `contrast, variance` (ny, nx).
     """
-    terms = image.noise.terms(image.data, np.zeros(image.grid.shape), 0.0)
-    information = terms.information * terms.by_signal**2
+    information = image.noise.terms(image.data, np.zeros(image.grid.shape), 0.0).information
     with np.errstate(divide="ignore", invalid="ignore"):
         contrast = image.noise.measured_signal(image.data)
     used = (information > 0) & np.isfinite(contrast)

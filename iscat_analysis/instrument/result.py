@@ -21,7 +21,7 @@ from iscat_analysis.config import (
 )
 from iscat_analysis.instrument.measure import Judgement, Measured
 from iscat_analysis.instrument.particle_image import Build, ParticleImage, contrast_of
-from iscat_analysis.optics.field_map import BEND, DRIFT
+from iscat_analysis.optics.local import BEND, DRIFT
 from iscat_analysis.optics.parameters import (
     FIELD,
     FOCUS_STEP,

@@ -29,7 +29,7 @@ from scipy.special import expit, logsumexp
 from iscat_analysis.instrument.joint_fit import asked_changes, excess
 from iscat_analysis.instrument.measure import TWIN_GAP
 from iscat_analysis.instrument.particle_image import Build, ParticleImage
-from iscat_analysis.optics.field_map import BASES
+from iscat_analysis.optics.local import BASES
 from iscat_analysis.optics.parameters import FREE, Prior, Settings, free_names
 from iscat_analysis.records import FloatArray, Mapper
 from iscat_analysis.trust.systematic import REJECTED_SHARE

@@ -1,7 +1,7 @@
 """Whether the optics change over the field or during a landing movie, and learned with that.
 
 Pictures of particles at other places, or of other times, tell it: what they ask to change about the
-optics is then a known function of place or time (`iscat_analysis.optics.field_map`).  Few pictures
+optics is then a known function of place or time (`iscat_analysis.optics.local`).  Few pictures
 lie at random places at random times, so that a focus that is tilted looks like one that drifts, and
 the other way round.  Therefore the kinds of change compete: the one that the pictures ask for most
 is tried first, and stays if it describes pictures better that were not fitted; the next is asked
@@ -27,7 +27,7 @@ from iscat_analysis.instrument.measure import HELD_OUT
 from iscat_analysis.instrument.microscope import microscopes, reach_nm, with_heights
 from iscat_analysis.instrument.particle_image import Build, ParticleImage, with_masses
 from iscat_analysis.movie import Stack
-from iscat_analysis.optics.field_map import (
+from iscat_analysis.optics.local import (
     BASES,
     BEND,
     DRIFT,

@@ -47,7 +47,7 @@ from iscat_analysis.fitting.events import index_finding
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Run
-from iscat_analysis.inference.height_spread import spread_of_heights
+from iscat_analysis.inference.heights import spread_of_heights
 from iscat_analysis.landing.chunks import ChunkNode, ChunkRunner, ChunkStore
 from iscat_analysis.landing.merging import MergedChunks
 from iscat_analysis.records import CountSource, FloatArray, Status, counted

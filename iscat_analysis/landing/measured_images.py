@@ -25,9 +25,9 @@ from scipy import fft
 
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import BRIGHT_SNR, IN_VAIN, Region
+from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise import conditional
 from iscat_analysis.inference.recognition import may_be_large, model_of, recognised
 from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
 from iscat_analysis.optics.forward import PixelGrid

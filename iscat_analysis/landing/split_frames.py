@@ -16,7 +16,7 @@ from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event, Region, photons_scale
 from iscat_analysis.fitting.field import total_signal
 from iscat_analysis.fitting.pattern import LocalPattern
-from iscat_analysis.inference.split_frames import (
+from iscat_analysis.inference.repeats import (
     PARTS,
     Response,
     Series,

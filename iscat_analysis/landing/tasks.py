@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from iscat_analysis.fitting.events import Event, Region, Told, region_around
 from iscat_analysis.fitting.pattern import LocalPattern
+from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise import conditional
 from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import BoolArray, Clip, FloatArray, Trace, Windows

@@ -19,26 +19,22 @@ from iscat_analysis._kernels.pupil import rectangle
 from iscat_analysis._kernels.radial import STEP
 from iscat_analysis.config import Calibration, Config, Optics, Particle
 from iscat_analysis.errors import ConfigError, ContrastError
+from iscat_analysis.last_used import memoize
 from iscat_analysis.optics.aperture import (
     NEAR_CRITICAL,
     Aperture,
     aperture,
     aperture_on,
     critical_angle,
+    is_coherent,
+    spectrum,
 )
-from iscat_analysis.optics.blur import wiggled
-from iscat_analysis.optics.coherence import is_coherent, spectrum
-from iscat_analysis.optics.collected import collected_area_nm2
-from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.optics.materials import material
 from iscat_analysis.optics.measured import MeasuredField, Template, sha256_of
-from iscat_analysis.optics.memoize import memoize
-from iscat_analysis.optics.model import ForwardModel
-from iscat_analysis.optics.pixels import PixelArea
-from iscat_analysis.optics.rods import Rod, rod_of
+from iscat_analysis.optics.model import ForwardModel, collected_area_nm2, wiggled
+from iscat_analysis.optics.pixels import PixelArea, PixelGrid
 from iscat_analysis.optics.scale import MassScale, carry_refusal
+from iscat_analysis.optics.scatterers import Rod, Sphere, material, rod_of, sphere_of
 from iscat_analysis.optics.sized import sized
-from iscat_analysis.optics.spheres import Sphere, sphere_of
 from iscat_analysis.optics.waves import check_table, field_of
 from iscat_analysis.units import KILODALTON_KG, NM
 

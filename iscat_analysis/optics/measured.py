@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.lattice import FILTER, LATTICE_STEP, lattice_half, undo_window, window
 from iscat_analysis._kernels.lens import LatticeLens
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.optics.memoize import memoize
+from iscat_analysis.last_used import memoize
 from iscat_analysis.reading import LARGEST_TEMPLATE_BYTES, npz_of, read_bytes
 
 FloatArray = NDArray[np.float64]

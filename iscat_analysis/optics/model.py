@@ -3,6 +3,27 @@
 Simulation, fits, posterior and bounds all use `ForwardModel`.  Its *signal* is
 the contrast C in the interferometric schemes and |E_sca|² for unit incident amplitude in dark field
 (D21, section II; physics.md, sections 1–3 and 8).
+
+Scattered light that the pupil collects, as an area and in photons (physics.md, section 1).
+
+Images of several particles of one kind on the same pixels.
+
+Images of particles that move during the exposure.
+
+An image is the average along the path.  During the exposure E, free diffusion has the variance
+D E/3 along each axis about the mean position: the variance 2Dt about the start averages to D E, and
+that of the mean is 2D E/3.  At time t of the exposure the position is normal about the mean, with
+the variance v(t) = 2D E (1/3 − t/E + t²/E²), which averages to q = D E/3.  Each plane wave of the
+field, with wave vector k along the axis, is multiplied by the average of exp(−k²v(t)/2) over the
+exposure.  The interference is linear in the field, so that this average is exact and takes no
+additional time: the pupil becomes darker towards its edge.  A normal distribution of variance q
+would make it too dark, by 0.05 % of the mass at 0.8 µm²/s and 1.5 % at 5 µm²/s in 3 ms.  The
+variance of a single path differs from frame to frame by 63 % of its mean (standard deviation of
+both axes together, from the eigenvalues (2/π²n²) D E of Brownian motion about its mean,
+Σ n⁻⁴ / (Σ n⁻²)² = 2/5); this scatters masses, `PATH_SPREAD`.
+
+For the scattered light |e|² the square of the averaged field is used, which is too small by
+q |∇e|².  This is a small part of |e|², which is itself a small part of the contrast of a protein.
 """
 
 from __future__ import annotations
@@ -11,7 +32,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,21 +44,70 @@ from iscat_analysis._kernels.lens import LatticeLens, Lens, RoundLens
 from iscat_analysis._kernels.radial import POWERS, AxialTable, profile_between
 from iscat_analysis.config import Optics
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.last_used import memoize
 from iscat_analysis.optics.aperture import Aperture
-from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.optics.materials import Material
 from iscat_analysis.optics.measured import MeasuredField
-from iscat_analysis.optics.memoize import memoize
-from iscat_analysis.optics.pixels import PixelArea
+from iscat_analysis.optics.pixels import PixelArea, PixelGrid
 from iscat_analysis.optics.scale import MassScale
-from iscat_analysis.optics.sensitivity import check_names, sensitivity_lattices, signal_derivatives
+from iscat_analysis.optics.scatterers import Material
 from iscat_analysis.optics.stamp import sample_picture
-from iscat_analysis.optics.waves import Field, LatticeField, RadialField, axial_table
+from iscat_analysis.optics.waves import (
+    Field,
+    LatticeField,
+    RadialField,
+    axial_table,
+    check_names,
+    sensitivity_lattices,
+    signal_derivatives,
+)
+from iscat_analysis.records import FloatArray
 
-FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+Values = Sequence[float] | FloatArray
+"""Values of the parameters of a particle model."""
+
 _TABLES_KEPT = 4  # cached heights with their derivatives or tables, some MB each
+_LARGEST_GROWTH = 0.5  # largest relative change of a mass in one step of a fit
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number that a particle model depends on.
+
+    Attributes
+    ----------
+    name, unit : str
+        What it is, and the unit of its values.
+    limits : (float, float)
+        Values for which the model is known.
+    step, growth : float
+        Largest change in one step of a fit, and the same over its size.
+    prior : (float, float), optional
+        Mean and standard deviation of a normal prior.
+    scale : MassScale, optional
+        How a fitted amplitude becomes the mass that is reported.
+    """
+
+    name: str
+    unit: str = ""
+    limits: tuple[float, float] = (-math.inf, math.inf)
+    step: float = math.inf
+    growth: float = math.inf
+    prior: tuple[float, float] | None = None
+    scale: MassScale | None = None
+
+    def reported(self, values: FloatArray) -> FloatArray:
+        """Give the values that are reported, of fitted ones."""
+        return values if self.scale is None else self.scale.mass(values)
+
+    def slope(self, value: float) -> float:
+        """Give the change of the reported value with the fitted one."""
+        return 1.0 if self.scale is None else self.scale.slope(value)
+
+    def fitted(self, value: float) -> float:
+        """Give the fitted value of a reported one."""
+        return value if self.scale is None else self.scale.amplitude(value)
 
 
 @dataclass(frozen=True)
@@ -63,6 +133,16 @@ class ForwardModel:
     def is_sized(self) -> bool:
         """Whether particles are spheres, whose picture changes its shape with their size."""
         return False
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Place and mass, of which fits take the amplitude."""
+        wavelength = self.optics.wavelength_nm
+        return (
+            *(Parameter(name, "nm", step=wavelength / 4) for name in ("x_nm", "y_nm")),
+            Parameter("z_nm", "nm", self.z_range_nm, wavelength / 10),
+            Parameter("mass_kda", "kDa", growth=_LARGEST_GROWTH, scale=self.scale),
+        )
 
     def at(self, amplitude: float) -> ForwardModel:
         """Give the model whose pictures grow in proportion to the amplitude near this one."""
@@ -172,17 +252,16 @@ class ForwardModel:
         Shapes: `signal` (ny, nx), `gradient` (4, ny, nx).
         """
         amplitude = self.scale.amplitude(mass_kda)
-        signal, gradient = self.amplitude_gradient(grid, x_nm, y_nm, z_nm, amplitude)
+        signal, gradient = self.signal(grid, (x_nm, y_nm, z_nm, amplitude))
         gradient[3] /= self.scale.slope(amplitude)
         return signal, gradient
 
-    def amplitude_gradient(
-        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, amplitude: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Signal and its derivatives in (x, y, z, a), a the amplitude.
+    def signal(self, grid: PixelGrid, values: Values) -> tuple[FloatArray, FloatArray]:
+        """Signal and its derivatives in `values` = (x, y, z, a), a the amplitude.
 
-        Shapes: `signal` (ny, nx), `gradient` (4, ny, nx).
+        Shapes: `values` (4,), `signal` (ny, nx), `gradient` (4, ny, nx).
         """
+        x_nm, y_nm, z_nm, amplitude = map(float, values)
         rows = np.empty((grid.shape[0], 5, grid.shape[1]))
         signal_gradient(self.profile(z_nm, 2), *self._geometry(grid, x_nm, y_nm, amplitude), rows)
         out = np.moveaxis(rows, 1, 0)
@@ -313,3 +392,97 @@ class ForwardModel:
                 f"was built for {self.reach_nm:.0f} nm: give forward_model a larger reach_nm"
             )
         return self.lens, self.pixels(grid), x_nm, y_nm, amplitude
+
+
+_AZIMUTHS = 8  # the light of a dipole is a trigonometric polynomial of order 4
+
+
+def collected_area_nm2(model: ForwardModel, z_nm: float, mass_kda: float) -> float:
+    """Scattered light that the pupil collects, as an equivalent area of reference.
+
+    It is counted before mask and analyser; aberrations do not change it.  Multiplied by the
+    background per area it gives the collected scattered photons.
+    """
+    if model.is_measured:
+        return math.nan
+    amplitude = model.scale.amplitude(mass_kda)
+    opening = model.at(amplitude).aperture
+    p, phi = opening.pupil, np.linspace(0.0, 2 * math.pi, _AZIMUTHS, endpoint=False)
+    decay = np.exp(-2 * p.axial.imag * model.centre_nm(z_nm, amplitude))
+    density = (np.abs(opening.polarised(phi)) ** 2).sum(0).mean(1) * np.sin(p.theta) * decay
+    pupil_integral = 2 * math.pi * float(np.sum(p.weight * density))
+    medium = 1.0 if model.optics.emission == "reciprocal" else 1 / model.optics.n_immersion**2
+    over = model.reference**2 if model.rho else 1.0
+    e1 = abs(model.strength) * amplitude
+    return e1**2 * medium * pupil_integral / over
+
+
+def photons_per_intensity(model: ForwardModel, photons_per_frame: float, pixel_nm: float) -> float:
+    """Dark field's scale s: photoelectrons per pixel and frame for unit |E_sca|²."""
+    area = collected_area_nm2(model, model.height_nm, model.material.mass_kda)
+    return photons_per_frame * pixel_nm**2 / area
+
+
+def signals_within(model: ForwardModel, grid: PixelGrid, theta: FloatArray) -> FloatArray:
+    """Draw each particle alone, if it is within the reach of its model.
+
+    Shapes: `theta` (n, 4), result (n, ny, nx).
+    """
+    far_x, far_y = (
+        np.maximum(np.abs(axis[0] - place), np.abs(axis[-1] - place)) + grid.pixel_nm / 2
+        for axis, place in ((grid.x_nm, theta[:, 0]), (grid.y_nm, theta[:, 1]))
+    )
+    near = np.flatnonzero(np.hypot(far_x, far_y) <= model.reach_nm)
+    out = np.zeros((len(theta), *grid.shape))
+    lens, pixels = model.lens, model.pixels(grid)
+    for number, (x, y, z, amplitude) in zip(near.tolist(), theta[near].tolist(), strict=True):
+        signal_image(model.profile(z, 1), lens, pixels, x, y, amplitude, out[number])
+    return out
+
+
+Model = TypeVar("Model", bound=ForwardModel)
+
+PATH_SPREAD = math.sqrt(2 / 5)
+"""Standard deviation of a path's variance in one exposure over its mean, both axes together."""
+
+_POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(3)
+_TIMES = (_POINTS + 1) / 4  # of the first half of the exposure, which the second mirrors
+_SHARES: list[float] = (_WEIGHTS / 2).tolist()
+_SPREADS: list[float] = (2 - 6 * _TIMES + 6 * _TIMES**2).tolist()
+"""v(t)/q: exact to 1e-6 of the image for blurs up to half the resolution."""
+
+
+def spreads(variance_nm2: float, *, each_axis: bool = False) -> list[tuple[float, float]]:
+    """Give the weights and variances of the normal distributions that make up a blur."""
+    wider = math.sqrt(4 / 3) if each_axis else 1.0
+    ratios = [1 + wider * (v - 1) for v in _SPREADS]
+    return [(share, variance_nm2 * v) for share, v in zip(_SHARES, ratios, strict=True)]
+
+
+def path_variance_nm2(d_um2_s: float, exposure_s: float) -> float:
+    """Variance of a path about its mean position during an exposure."""
+    return d_um2_s * 1e6 * exposure_s / 3
+
+
+def blurred(model: Model, variance_nm2: float, *, upwards: bool) -> Model:
+    """Average a model over the path of a particle that diffuses."""
+    if variance_nm2 == 0:
+        return model
+    wave = model.wave
+    if not isinstance(wave, RadialField | LatticeField):
+        raise ConfigError('optics.psf = "measured" cannot be averaged along a path')
+    exponent = np.asarray(wave.transverse**2, dtype=complex)
+    if upwards:
+        exponent = exponent + wave.axial**2
+    dimmed = sum(share * np.exp(-exponent * v / 2) for share, v in spreads(variance_nm2))
+    return model.dimmed(np.asarray(dimmed))
+
+
+def wiggled(model: Model, sd_nm: float) -> Model:
+    """Average a model over the positions of a wiggling particle, normal about their mean."""
+    if sd_nm == 0:
+        return model
+    wave = model.wave
+    if not isinstance(wave, RadialField | LatticeField):
+        raise ConfigError('optics.psf = "measured" has the wiggle of the particles it shows')
+    return model.dimmed(np.exp(-0.5 * (wave.transverse * sd_nm) ** 2))

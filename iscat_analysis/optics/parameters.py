@@ -11,7 +11,7 @@ import numpy as np
 
 from iscat_analysis.config import JUMPS, MOVES, Config, field_keys
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.optics.field_map import BASES, BEND, DRIFT, WEIGHTS, moves_in
+from iscat_analysis.optics.local import BASES, BEND, DRIFT, WEIGHTS, moves_in
 from iscat_analysis.records import BoolArray, FloatArray
 
 FOCUS_STEP = "focus_step_nm"

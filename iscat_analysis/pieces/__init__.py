@@ -21,10 +21,8 @@ region has its centre at (0, 0) nm.
 from __future__ import annotations
 
 from iscat_analysis.config import CameraConfig as Camera
-from iscat_analysis.pieces.images import psf
-from iscat_analysis.pieces.likelihoods import LogLikelihood, log_likelihood
-from iscat_analysis.pieces.limits import crb, qcrb
-from iscat_analysis.pieces.regions import fit_rois
+from iscat_analysis.pieces.limits import crb, psf, qcrb
+from iscat_analysis.pieces.regions import LogLikelihood, fit_rois, log_likelihood
 from iscat_analysis.pieces.rods import fit_rods
 
 __all__ = [

@@ -1,30 +1,32 @@
-"""Fits of rods of any direction in regions of interest."""
+"""Fits of rods of any direction in regions of interest.
+
+A rod whose direction is unknown: the maxima of its likelihood in place, mass and both angles.
+
+A rod and the same rod turned by 180° are one.  Every other direction has its own picture; but where
+the light is faint, rods that are mirror images of one another look alike, so that the fit begins in
+directions all over the half sphere and keeps every maximum.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
+from scipy.ndimage import correlate
 
 from iscat_analysis.config import CameraConfig, Optics, Particle
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.inference.fit import POOR_FIT_P
+from iscat_analysis.inference.fit import POOR_FIT_P, ModelFit, fit_model, goodness_of_fit
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.orientation import (
-    AMPLITUDE,
-    AZIMUTH,
-    TILT,
-    Direction,
-    find_directions,
-    judge,
-)
-from iscat_analysis.optics.rods import Rod, rod_of
-from iscat_analysis.pieces.counts import gather
-from iscat_analysis.pieces.setups import config_of
-from iscat_analysis.records import Status, verdict
+from iscat_analysis.inference.models import TurningRod
+from iscat_analysis.optics.pixels import PixelGrid
+from iscat_analysis.optics.scatterers import Rod, rod_of
+from iscat_analysis.pieces.counts import config_of, gather
+from iscat_analysis.records import Box, FloatArray, Status, verdict
 
 AMBIGUITY_ODDS = 1e-3
 """Likelihood of another direction, over that of the best, above which the row is flagged."""
@@ -32,6 +34,7 @@ AMBIGUITY_ODDS = 1e-3
 WIDE_DEG = 5.0
 """Error of the direction above which it is flagged as well: it is no longer normal."""
 
+AMPLITUDE, AZIMUTH, TILT = 3, 4, 5
 _NAMES = {"x_nm": 0, "y_nm": 1, "mass_kda": AMPLITUDE, "azimuth_deg": AZIMUTH, "tilt_deg": TILT}
 
 
@@ -129,7 +132,7 @@ def fit_rods(
     return pd.DataFrame(rows)
 
 
-def _row(likelihood: Likelihood, found: list[Direction], rod: Rod) -> dict[str, Any]:
+def _row(likelihood: Likelihood, found: list[ModelFit], rod: Rod) -> dict[str, Any]:
     """Put the maxima of one region into a row."""
     best, *others = found
     chi2, p_value = judge(likelihood, best, rod)
@@ -159,3 +162,108 @@ def _row(likelihood: Likelihood, found: list[Direction], rod: Rod) -> dict[str, 
         "p_value": p_value,
         "status": str(verdict(flags)[0]),
     }
+
+
+_RINGS = ((25.0, 4), (60.0, 6), (90.0, 4))  # tilts, and azimuths of each, where fits begin
+_ASIDE_DEG = 20.0  # their first azimuth; across the polarisation, the tilt has no slope
+_SAME_DEG = 3.0  # between two directions that are one maximum, found twice
+_SAME_VALUE = 0.1  # of their log-likelihoods
+_LARGEST, _LEAST_SHARE = 100.0, 1e-3  # amplitude over that of the nominal mass
+_EDGE_SHARE = 0.15  # of the region's side at each edge, where no fit begins
+
+
+def find_directions(
+    likelihood: Likelihood, z_nm: float, rod: Rod, *, level: bool
+) -> list[ModelFit]:
+    """Fit x, y, mass and both angles at a height: every maximum, the best first.
+
+    θ = (x, y, z, a, azimuth, tilt, level).
+    """
+    rods = TurningRod(likelihood.model, rod)
+    of_rods = likelihood.under(rods)
+    free = np.array([True, True, False, True, True, True, level])
+    reach = likelihood.model.optics.wavelength_nm / 2
+    largest = _LARGEST * likelihood.model.nominal_amplitude
+    aside = likelihood.model.optics.polarization_deg + _ASIDE_DEG
+    box = np.array([reach, reach, 0.0, math.inf, math.inf, math.inf, 1.0])
+    found = []
+    for azimuth, tilt in _everywhere():
+        start = _start(likelihood, z_nm, rods, aside + azimuth, tilt)
+        lower, upper = start - box, start + box
+        lower[AMPLITUDE], upper[AMPLITUDE] = 0.0, largest
+        end = fit_model(of_rods, np.minimum(start, upper), Box(free, lower, upper))
+        found.append(replace(end, theta=_upwards(end.theta)))
+    best = max(found, key=lambda each: each.log_likelihood)
+    maxima = [each for each in found if each.converged or each is best]
+    return _distinct(sorted(maxima, key=lambda each: -each.log_likelihood))
+
+
+def judge(likelihood: Likelihood, direction: ModelFit, rod: Rod) -> tuple[float, float]:
+    """Give the reduced χ² and the p-value of one maximum.
+
+    The two angles are not among the parameters that were fitted, so that p is a little too large.
+    """
+    *_, azimuth, tilt, _ = direction.theta.tolist()
+    model = TurningRod(likelihood.model, rod).turned(azimuth, tilt)
+    angles = [AZIMUTH, TILT]
+    free = np.isfinite(np.delete(direction.sigma, angles))
+    theta = np.delete(direction.theta, angles)
+    return goodness_of_fit(replace(likelihood, model=model), theta, free)
+
+
+def axis_of(theta: FloatArray) -> FloatArray:
+    """Give the unit vector along the rod."""
+    azimuth, tilt = np.radians(theta[[AZIMUTH, TILT]])
+    flat = math.sin(tilt)
+    return np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.cos(tilt)])
+
+
+def _everywhere() -> list[tuple[float, float]]:
+    """Azimuths and tilts all over the half sphere; lying rods have half of the azimuths."""
+    return [
+        (k * (360.0 if tilt < 90 else 180.0) / count, tilt)
+        for tilt, count in _RINGS
+        for k in range(count)
+    ]
+
+
+def _start(
+    likelihood: Likelihood, z_nm: float, rods: TurningRod, azimuth_deg: float, tilt_deg: float
+) -> FloatArray:
+    """Give θ where the picture of a direction correlates best with what the counts show."""
+    model, grid = rods.turned(azimuth_deg, tilt_deg), likelihood.grid
+    odd = PixelGrid.centred(min(grid.shape) // 2 * 2 - 1, grid.pixel_nm)
+    picture = model.amplitude_image(odd, 0.0, 0.0, z_nm, model.nominal_amplitude)
+    matched = correlate(np.nan_to_num(likelihood.measured_signal()), picture, mode="constant")
+    margin = [int(_EDGE_SHARE * size) for size in grid.shape]
+    inside = tuple(slice(m, size - m) for m, size in zip(margin, grid.shape, strict=True))
+    row, column = np.unravel_index(np.argmax(matched[inside]), matched[inside].shape)
+    share = max(float(matched[inside][row, column] / np.sum(picture**2)), _LEAST_SHARE)
+    amplitude = model.nominal_amplitude * (share if model.rho else math.sqrt(share))
+    x, y = grid.x_nm[margin[1] + column], grid.y_nm[margin[0] + row]
+    return np.array([x, y, z_nm, amplitude, azimuth_deg, tilt_deg, 0.0])
+
+
+def _upwards(theta: FloatArray) -> FloatArray:
+    """Turn the rod so that its tilt is 0 to 90°, and its azimuth 0 to 360° (lying: 180°)."""
+    out, axis = theta.copy(), axis_of(theta)
+    if axis[2] < 0:
+        axis = -axis
+    out[AZIMUTH] = math.degrees(math.atan2(axis[1], axis[0])) % 360
+    out[TILT] = math.degrees(math.acos(min(axis[2], 1.0)))
+    return out
+
+
+def _distinct(found: list[ModelFit]) -> list[ModelFit]:
+    """Leave out maxima that were found before."""
+    kept: list[ModelFit] = []
+    for one in found:
+        if not any(_same(one, other) for other in kept):
+            kept.append(one)
+    return kept
+
+
+def _same(one: ModelFit, other: ModelFit) -> bool:
+    cosine = min(abs(float(axis_of(one.theta) @ axis_of(other.theta))), 1.0)
+    gap = abs(one.log_likelihood - other.log_likelihood)
+    return math.degrees(math.acos(cosine)) < _SAME_DEG and gap < _SAME_VALUE

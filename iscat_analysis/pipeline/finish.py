@@ -40,10 +40,10 @@ from iscat_analysis.findings.particles import SPREAD_NOT_MEASURED
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Run
-from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.nuisances import Evidence
+from iscat_analysis.inference.repeats import EmpiricalSpread
 from iscat_analysis.movie import Stack
-from iscat_analysis.optics.field_map import changes_at, terms_of, when
+from iscat_analysis.optics.local import changes_at, terms_of, when
 from iscat_analysis.pipeline.kinds import Kind
 from iscat_analysis.records import (
     FREE_PARAMETERS,

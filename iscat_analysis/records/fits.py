@@ -90,7 +90,7 @@ class FitResult:
     sigma : ndarray, shape (4,)
         Standard deviations from the observed information, in the order of `PARAMETERS`;
         NaN where not free.  With few photons, those of positions follow from the likelihood three
-        errors away, if this is larger; see `iscat_analysis.inference.reach`.
+        errors away, if this is larger; see `iscat_analysis.inference.fit.reach`.
     covariance : ndarray, shape (n_free, n_free)
         Inverse observed information, with these standard deviations.
     contrast : float

@@ -17,8 +17,7 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 
 from iscat_analysis.config import parse_config
-from iscat_analysis.optics.materials import material
-from iscat_analysis.optics.spheres import Sphere, scattering_length_nm, sphere_of
+from iscat_analysis.optics.scatterers import Sphere, material, scattering_length_nm, sphere_of
 from iscat_analysis.records import Analysis, BoolArray, FloatArray, TrackStatus, track_numbers
 from iscat_analysis.report.answer import track_quantity, tracks_of
 from iscat_analysis.report.style import (

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.config import Config, SimulatedMover
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.optics.materials import material
+from iscat_analysis.optics.scatterers import material
 from iscat_analysis.records import FloatArray
 from iscat_analysis.units import sphere_mass_kda
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.noise import compile_kernels, parts_of
+from iscat_analysis.inference.fit import compile_kernels, fit_particle, parts_of
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.records import PARAMETERS, BoolArray, Box, FloatArray
 from iscat_analysis.study.scores import rank_test

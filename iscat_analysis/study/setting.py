@@ -19,8 +19,8 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import Region, region_likelihood
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.optics.model import photons_per_intensity
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Candidate, FloatArray, Windows
 from iscat_analysis.study.estimator_setup import EstimatorSetup
 

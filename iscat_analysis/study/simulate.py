@@ -31,11 +31,10 @@ from iscat_analysis.camera import camera_from_config, read_map
 from iscat_analysis.config import AUTO, Config, Particle
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
-from iscat_analysis.optics.collected import photons_per_intensity
-from iscat_analysis.optics.field_map import terms_of
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.optics.local import LocalModels
-from iscat_analysis.optics.materials import material
+from iscat_analysis.optics.local import LocalModels, terms_of
+from iscat_analysis.optics.model import photons_per_intensity
+from iscat_analysis.optics.scatterers import material
 from iscat_analysis.records import FloatArray, Progress, silent
 from iscat_analysis.study.movers import MovingParticle, place_movers, track_rows
 from iscat_analysis.threads import threads

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.noise import compile_kernels, parts_of
+from iscat_analysis.inference.fit import compile_kernels, fit_particle, parts_of
 from iscat_analysis.records import BoolArray, FitResult, FloatArray, Status
 from iscat_analysis.study.setting import Setting
 from iscat_analysis.threads import threads

@@ -27,7 +27,7 @@ from scipy.special import ndtr, ndtri
 from iscat_analysis.bounds import Experiment, event_bounds, holevo_over_quantum
 from iscat_analysis.bounds.detection import detection_limit
 from iscat_analysis.bounds.experiment import expected_likelihood
-from iscat_analysis.optics.collected import collected_area_nm2, photons_per_intensity
+from iscat_analysis.optics.model import collected_area_nm2, photons_per_intensity
 from iscat_analysis.records import PARAMETERS, BoolArray, FloatArray
 from iscat_analysis.study.scores import MIN_TRIALS
 

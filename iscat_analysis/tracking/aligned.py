@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.fitting.context import AnalysisContext
+from iscat_analysis.inference.counts import poisson
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise import poisson
 from iscat_analysis.instrument.particle_image import ParticleImage
-from iscat_analysis.optics.blur import blurred
 from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.optics.model import blurred
 from iscat_analysis.optics.parameters import FAINTEST
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.tracking.joint.common import variances_left

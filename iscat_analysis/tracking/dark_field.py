@@ -20,7 +20,7 @@ from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Region, photons_scale
 from iscat_analysis.fitting.field import add_signal
 from iscat_analysis.fitting.results import DetectionResult
-from iscat_analysis.optics.blur import PATH_SPREAD, blurred, path_variance_nm2
+from iscat_analysis.optics.model import PATH_SPREAD, blurred, path_variance_nm2
 from iscat_analysis.records import FloatArray, Windows, is_event
 from iscat_analysis.species.diffusion import estimate_diffusion
 from iscat_analysis.species.tracks import rows_by_track

@@ -19,7 +19,7 @@ from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.optics.blur import path_variance_nm2
+from iscat_analysis.optics.model import path_variance_nm2
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, Progress
 from iscat_analysis.species.diffusion import estimate_diffusion
 from iscat_analysis.threads import start_in_thread

@@ -10,9 +10,8 @@ from scipy.special import gammainc, gammaincc, ndtr
 from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.inference.fit import OUTWARD, POOR_FIT_P
-from iscat_analysis.optics.blur import PATH_SPREAD, blurred
-from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
+from iscat_analysis.optics.model import PATH_SPREAD, blurred, collected_area_nm2
 from iscat_analysis.pieces.regions import saturated_near
 from iscat_analysis.records import PARAMETERS, BoolArray, FloatArray, Status, make_rows, verdict
 from iscat_analysis.tracking.joint.common import variances_left

@@ -18,8 +18,8 @@ import numpy as np
 import scipy
 
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.optics.blur import blurred
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
+from iscat_analysis.optics.model import blurred
 from iscat_analysis.records import FloatArray
 from iscat_analysis.tracking.moving import TrackedRows
 

@@ -30,9 +30,8 @@ from iscat_analysis.inference.common_size import (
 )
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.optics.blur import blurred, path_variance_nm2
-from iscat_analysis.optics.seated import LARGEST_INDEX, LEAST_CONTRAST
-from iscat_analysis.optics.sized import SizedModel
+from iscat_analysis.optics.model import blurred, path_variance_nm2
+from iscat_analysis.optics.sized import LARGEST_INDEX, LEAST_CONTRAST, SizedModel
 from iscat_analysis.records import FloatArray, Status, verdict
 from iscat_analysis.species.diffusion import (
     LEAST_POSITIONS,

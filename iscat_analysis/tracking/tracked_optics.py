@@ -21,7 +21,7 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.inference.cause import PIXEL, Cause, likely_cause
-from iscat_analysis.inference.goodness import goodness_of_fit
+from iscat_analysis.inference.fit import goodness_of_fit
 from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.learning import adopted
 from iscat_analysis.instrument.loop import Rounds, learn

@@ -18,10 +18,9 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Region, region_likelihood
 from iscat_analysis.fitting.ranges import background_mode
-from iscat_analysis.optics.blur import blurred, path_variance_nm2
-from iscat_analysis.optics.drawing import signals_within
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
-from iscat_analysis.optics.materials import material
+from iscat_analysis.optics.model import blurred, path_variance_nm2, signals_within
+from iscat_analysis.optics.scatterers import material
 from iscat_analysis.records import (
     Film,
     FloatArray,

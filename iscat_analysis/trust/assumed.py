@@ -30,7 +30,7 @@ import pandas as pd
 from iscat_analysis.bounds import peak_gradient
 from iscat_analysis.config import Config
 from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, PixelGrid, forward_model, signed_peak
-from iscat_analysis.optics.materials import material
+from iscat_analysis.optics.scatterers import material
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
 from iscat_analysis.trust.response import Response, at_standards, has_own_index, response_of
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.inference.empirical_spread import EmpiricalSpread
+from iscat_analysis.inference.repeats import EmpiricalSpread
 from iscat_analysis.records import FloatArray, Status
 from iscat_analysis.trust.systematic import Contribution
 

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.inference.empirical_spread import EmpiricalSpread, pooled
-from iscat_analysis.inference.split_frames import BLOCK_ROWS
+from iscat_analysis.inference.repeats import BLOCK_ROWS, EmpiricalSpread, pooled
 from iscat_analysis.records import FREE_PARAMETERS, REPEAT_COLUMNS, FloatArray, Status, has_only
 from iscat_analysis.search.empty import EmptySpread
 

@@ -33,8 +33,8 @@ import scipy
 from scipy.special import chdtrc, chdtri, ndtri
 
 from iscat_analysis.config import Config
-from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.nuisances import Evidence
+from iscat_analysis.inference.repeats import EmpiricalSpread
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.records import BoolArray, FloatArray, Status, has_only
 from iscat_analysis.trust.response import response_of

@@ -33,8 +33,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from iscat_analysis.inference.empirical_spread import EmpiricalSpread
-from iscat_analysis.inference.split_frames import MODES, spectra_of
+from iscat_analysis.inference.repeats import MODES, EmpiricalSpread, spectra_of
 from iscat_analysis.records import FREE_PARAMETERS, BoolArray, FloatArray, Status, has_only
 
 _PRIOR = 0.1  # probability that a movie fluctuates, before its frames are looked at

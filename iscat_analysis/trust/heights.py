@@ -11,8 +11,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.config import Config
-from iscat_analysis.inference.height_spread import HeightSpread, spread_of_heights
-from iscat_analysis.inference.heights import has_prior
+from iscat_analysis.inference.heights import HeightSpread, has_prior, spread_of_heights
 from iscat_analysis.inference.nuisances import Evidence
 from iscat_analysis.records import FloatArray, Status, has_only
 

@@ -16,7 +16,7 @@ from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event, photons_scale
 from iscat_analysis.fitting.field import total_signal
 from iscat_analysis.inference.likelihood import LEVEL
-from iscat_analysis.inference.split_frames import LENGTHS
+from iscat_analysis.inference.repeats import LENGTHS
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import (
     FREE_PARAMETERS,
@@ -94,7 +94,7 @@ def empty_field(
     model, pixel = context.model, context.pixel_nm
     theta = np.median([fit.theta for fit in fits], axis=0)
     grid = PixelGrid.centred(context.roi_px | 1, pixel)
-    _, first = model.amplitude_gradient(grid, 0.0, 0.0, float(theta[2]), float(theta[3]))
+    _, first = model.signal(grid, (0.0, 0.0, theta[2], theta[3]))
     free = fits[0].box.free
     slopes = first[np.flatnonzero(free[:LEVEL])]
     n_free = len(slopes)

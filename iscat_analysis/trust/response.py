@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from iscat_analysis.bounds import eliminated, imitation, joint_information, peak_gradient
 from iscat_analysis.config import ABERRATIONS, Config, Optics, OpticsCovariance
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.counts import asimov_conditional, asimov_poisson
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise import asimov_conditional, asimov_poisson
-from iscat_analysis.inference.sizes import slopes_with_index
+from iscat_analysis.inference.models import SphereOfIndex
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model, peak_per_amplitude
 from iscat_analysis.optics.parameters import prior_of
 from iscat_analysis.optics.sized import SizedModel
@@ -110,7 +110,7 @@ class Response:
         With the index of the sphere free, that takes its part of the difference.
         """
         theta = self.theta(z_nm, amplitude)
-        signal, _ = self.model.amplitude_gradient(self.grid, *theta[:4].tolist())
+        signal, _ = self.model.signal(self.grid, theta[:4])
         further = self._along_index(theta) if index else []
         whole = joint_information(self.expected(theta), theta, (), [signal, *further])
         count = 1 + len(further)
@@ -185,7 +185,7 @@ class Response:
             raise TypeError(f"{type(self.model).__name__} has no index")
         x, y, z, amplitude, _ = theta.tolist()
         known = self.model.sphere.index.real
-        slopes = slopes_with_index(self.model, self.grid, (x, y, z), amplitude, known)[1]
+        slopes = SphereOfIndex(self.model).signal(self.grid, (x, y, z, amplitude, known))[1]
         return [slopes[-1]]
 
     @property

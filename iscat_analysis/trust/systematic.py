@@ -23,8 +23,8 @@ from scipy.special import log_ndtr
 
 from iscat_analysis.calibration import line_sigma_kda
 from iscat_analysis.config import Config, OpticsCovariance
-from iscat_analysis.optics.field_map import BASES, REFERENCE, WEIGHTS, centre_of, when
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
+from iscat_analysis.optics.local import BASES, REFERENCE, WEIGHTS, centre_of, when
 from iscat_analysis.optics.measured import Template
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
 from iscat_analysis.trust.assumed import INPUTS, assumed_error

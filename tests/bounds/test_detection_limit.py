@@ -16,7 +16,7 @@ from iscat_analysis.bounds import (
     power_searched,
 )
 from iscat_analysis.config import parse_config
-from iscat_analysis.inference import noise
+from iscat_analysis.inference import counts as noise
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import forward_model

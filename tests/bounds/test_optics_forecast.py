@@ -9,7 +9,7 @@ import pytest
 from calibrations import GRID, PHOTONS, PIXEL_NM, configuration, make_particle_images
 
 import iscat_analysis as ia
-from iscat_analysis.bounds.optics_forecast import forecast_optics
+from iscat_analysis.bounds.shared import forecast_optics
 from iscat_analysis.instrument.joint_fit import maximise
 from iscat_analysis.optics.parameters import FREE, is_term, settings_of
 
@@ -102,8 +102,8 @@ def test_a_fit_of_pictures_has_the_errors_that_were_foreseen() -> None:
 
 def test_masses_of_other_particles_err_by_what_was_foreseen() -> None:
     """Microscopes drawn from the forecast's covariance, and one particle fitted in each."""
+    from iscat_analysis.inference.counts import asimov_conditional
     from iscat_analysis.inference.likelihood import Likelihood
-    from iscat_analysis.inference.noise import asimov_conditional
     from iscat_analysis.optics.forward import forward_model
     from iscat_analysis.optics.parameters import with_settings
 

@@ -19,10 +19,9 @@ import iscat_analysis as ia
 from iscat_analysis.bounds import quantum_information
 from iscat_analysis.bounds.experiment import bounds_report
 from iscat_analysis.config import Config, configure
-from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.optics.materials import material
-from iscat_analysis.optics.rods import ANGLES, depolarisation, rod_of
+from iscat_analysis.optics.model import collected_area_nm2
+from iscat_analysis.optics.scatterers import ANGLES, depolarisation, material, rod_of
 from tests.rays import picture_of_rays
 
 FloatArray = NDArray[np.float64]

@@ -17,10 +17,10 @@ from iscat_analysis.bounds import (
     shared_sigma,
 )
 from iscat_analysis.config import Config, parse_config
+from iscat_analysis.inference.counts import asimov_conditional, asimov_poisson
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise import asimov_conditional, asimov_poisson
 from iscat_analysis.optics.forward import ForwardModel, forward_model
-from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.optics.pixels import PixelGrid
 
 GRID = PixelGrid.centred(23, PIXEL_NM)
 SHIFTS = {

@@ -12,7 +12,7 @@ from wanderers import SETTINGS, wander
 import iscat_analysis as ia
 from iscat_analysis.camera import Camera, LightModel, Seams, Smooth, find_light
 from iscat_analysis.fitting.context import make_context
-from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.study import Movie
 
 Array = NDArray[np.float64]

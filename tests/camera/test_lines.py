@@ -12,7 +12,7 @@ from scenes import PIXEL_NM, Stack, make_config
 import iscat_analysis as ia
 from iscat_analysis.camera import Camera, LightModel, SteadyFrames, with_lines
 from iscat_analysis.fitting.context import make_context
-from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.optics.pixels import PixelGrid
 
 Array = NDArray[np.float64]
 

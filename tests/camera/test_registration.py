@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from skimage.registration import phase_cross_correlation
 
 from iscat_analysis.camera import measure_drift
-from iscat_analysis.inference.noise_models import CONDITIONAL
+from iscat_analysis.inference.laws import CONDITIONAL
 from iscat_analysis.instrument.particle_image import ParticleImage, average_particle_images
 from iscat_analysis.optics.forward import PixelGrid
 

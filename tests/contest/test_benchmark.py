@@ -13,7 +13,7 @@ from microscopes import configuration, setting
 from sketches import sketch_figures
 
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference.prior import van_trees
+from iscat_analysis.inference.posterior import van_trees
 from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.report.benchmark import BENCHMARK_NAMES, benchmark_figures, render_benchmark
 from iscat_analysis.study import (

@@ -10,7 +10,7 @@ import pytest
 from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.inference import noise
+from iscat_analysis.inference import counts as noise
 from iscat_analysis.inference.cause import Cause, likely_cause
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.optics.forward import PixelGrid, forward_model

@@ -13,11 +13,11 @@ from iscat_analysis.config import Config
 from iscat_analysis.inference.common_size import CommonSize, common_sizes, fit_common_size
 from iscat_analysis.inference.counts import KNOWN, counts_likelihood
 from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.laws import Poisson
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise_models import Poisson
 from iscat_analysis.inference.posterior import sample_posterior
-from iscat_analysis.optics.blur import wiggled
 from iscat_analysis.optics.forward import PixelGrid, forward_model
+from iscat_analysis.optics.model import wiggled
 from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.records import Candidate, Status
 from iscat_analysis.tracking.sizes import SphereTrack, explained, table_of_sizes

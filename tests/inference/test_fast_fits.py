@@ -15,12 +15,21 @@ from iscat_analysis._kernels.hessian import PAIRS
 from iscat_analysis._kernels.image import signal_gradient, signal_image
 from iscat_analysis._kernels.scoring import image_score, image_value, picture_at, score_pass
 from iscat_analysis.config import Calibration
-from iscat_analysis.inference import noise
-from iscat_analysis.inference.fit import FOLLOWED, PLAIN, fit_particle, search_box
-from iscat_analysis.inference.goodness import ORDER, WAIST, gamma_above, three_tests
-from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
-from iscat_analysis.inference.noise_models import CONDITIONAL
-from iscat_analysis.inference.precision import precision
+from iscat_analysis.inference import counts as noise
+from iscat_analysis.inference.fit import (
+    FOLLOWED,
+    ORDER,
+    PLAIN,
+    WAIST,
+    fit_particle,
+    gamma_above,
+    precision,
+    search_box,
+    three_tests,
+)
+from iscat_analysis.inference.laws import CONDITIONAL
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood
+from iscat_analysis.inference.maximiser import Optimum
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import BoolArray, Candidate, FloatArray
 
@@ -175,7 +184,7 @@ def test_errors_are_those_of_the_observed_information(case: Case, free: tuple[bo
 
 def _structure(which: Likelihood, theta: FloatArray, free: BoolArray) -> float:
     """Give the p-value by Gram–Schmidt on vectors over the pixels."""
-    signal, gradient = which.model.amplitude_gradient(GRID, *theta[:4])
+    signal, gradient = which.model.signal(GRID, theta[:4])
     c0, c1, c2, c3 = (c[which.used] for c in which.data)
     level, s = math.exp(theta[LEVEL]), signal[which.used]
     if which.noise == CONDITIONAL:

@@ -9,8 +9,7 @@ import pytest
 from report_factory import make_analysis
 from scenes import PIXEL_NM, make_config
 
-from iscat_analysis.inference.empirical_spread import EmpiricalSpread, pooled
-from iscat_analysis.inference.split_frames import LENGTHS
+from iscat_analysis.inference.repeats import LENGTHS, EmpiricalSpread, pooled
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline import analyse
@@ -31,7 +30,7 @@ def _slopes(half_px: int) -> np.ndarray:
     """Give the derivatives of the signal by the parameters, of unit length."""
     model = forward_model(make_config(optics={"focus_nm": -500.0}), 4000.0)
     grid = PixelGrid.centred(2 * half_px + 1, PIXEL_NM)
-    _, first = model.amplitude_gradient(grid, 0.0, 0.0, 150.0, MASS_KDA)
+    _, first = model.signal(grid, (0.0, 0.0, 150.0, MASS_KDA))
     return np.asarray(first[:4] / np.sqrt((first[:4] ** 2).sum(axis=(1, 2)))[:, None, None])
 
 

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 import iscat_analysis as ia
+from iscat_analysis.inference.common_size import IndexFit, fit_index
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.free_index import IndexFit, fit_index
-from iscat_analysis.optics.materials import material
-from iscat_analysis.pieces.counts import gather
-from iscat_analysis.pieces.setups import config_of
+from iscat_analysis.optics.scatterers import material
+from iscat_analysis.pieces.counts import config_of, gather
 from iscat_analysis.records import Candidate, FitResult, Status
 from iscat_analysis.units import sphere_mass_kda
 

@@ -10,9 +10,9 @@ from scenes import PIXEL_NM, gold, make_config
 from scipy.stats import binom, poisson
 
 from iscat_analysis._kernels.radial import profile_at
-from iscat_analysis.inference import noise
+from iscat_analysis.inference import counts as noise
+from iscat_analysis.inference.laws import CONDITIONAL
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
-from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 
 # Sums of a few hundred logarithms of counts near 1e6 carry this much rounding.

@@ -10,9 +10,8 @@ import pytest
 from microscopes import PHOTONS, configuration, setting
 from scipy.stats import binom, kstest, poisson
 
-from iscat_analysis.inference.fit import POOR_FIT_P, fit_particle
-from iscat_analysis.inference.goodness import three_tests
-from iscat_analysis.inference.noise_models import attainable_tails
+from iscat_analysis.inference.fit import POOR_FIT_P, fit_particle, three_tests
+from iscat_analysis.inference.laws import attainable_tails
 from iscat_analysis.records import FitResult, FloatArray, Status
 from iscat_analysis.study import Setting, make_setting, run_trials, trial_generator
 

@@ -14,12 +14,11 @@ import pytest
 from scipy.signal import lfilter
 
 from iscat_analysis.config import OpticsCovariance, config_to_toml, load_config
-from iscat_analysis.inference.empirical_spread import EmpiricalSpread, pooled
+from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.height_spread import spread_of_heights
-from iscat_analysis.inference.noise import conditional
+from iscat_analysis.inference.heights import spread_of_heights
 from iscat_analysis.inference.nuisances import Evidence, evidence_of
-from iscat_analysis.inference.split_frames import BLOCK_ROWS, Series, repeats_of
+from iscat_analysis.inference.repeats import BLOCK_ROWS, EmpiricalSpread, Series, pooled, repeats_of
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import Candidate, FloatArray
 from iscat_analysis.search.dating import StepFrame, common_rise, go_on_rising, locate_step

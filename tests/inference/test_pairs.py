@@ -16,11 +16,10 @@ from instruments import PEAK_PER_KDA, Instrument, Pictures
 
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise import conditional
-from iscat_analysis.inference.nuisances import Evidence, evidence_of
-from iscat_analysis.inference.pairs import Pair, pair_of
+from iscat_analysis.inference.nuisances import Evidence, Pair, evidence_of, pair_of
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import Candidate, FitResult
 from iscat_analysis.trust.extension import Extension

@@ -9,11 +9,11 @@ import pytest
 from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.config import Config
-from iscat_analysis.inference import noise, posterior
+from iscat_analysis.inference import counts as noise
+from iscat_analysis.inference import posterior
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.posterior import sample_posterior
-from iscat_analysis.inference.prior import Prior
+from iscat_analysis.inference.posterior import Prior, sample_posterior
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.records import Candidate, FitResult
 

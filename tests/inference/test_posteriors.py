@@ -10,8 +10,7 @@ from microscopes import setting
 from scipy.stats import skew
 
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.posterior import sample_posterior
-from iscat_analysis.inference.prior import Prior, van_trees
+from iscat_analysis.inference.posterior import Prior, sample_posterior, van_trees
 from iscat_analysis.records import PARAMETERS, FloatArray, PosteriorResult, Status
 from iscat_analysis.study import (
     PosteriorRanks,

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from microscopes import setting
 
-from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.fit import AWAY, fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.reach import AWAY
 from iscat_analysis.records import FitResult
 from iscat_analysis.study import Setting, run_trials, trial_generator
 

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from iscat_analysis.config import Config, configure
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise import conditional
 from iscat_analysis.inference.recognition import may_be_large, recognised
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.optics.seated import SeatedModel, seated_models
+from iscat_analysis.optics.sized import SeatedModel, seated_models
 from iscat_analysis.records import Candidate, FitResult, Status
 from iscat_analysis.units import sphere_mass_kda
 from iscat_cli import main

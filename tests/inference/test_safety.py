@@ -9,10 +9,10 @@ import pytest
 from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference import noise
+from iscat_analysis.inference import counts as noise
 from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.laws import POISSON
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise_models import POISSON
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import Candidate
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from iscat_analysis.inference.noise_models import POISSON
+from iscat_analysis.inference.laws import POISSON
 from iscat_analysis.instrument.joint_fit import Estimate
 from iscat_analysis.instrument.measure import OpticsSearch
 from iscat_analysis.instrument.particle_image import ParticleImage
-from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.parameters import Prior, Settings
+from iscat_analysis.optics.pixels import PixelGrid
 
 HEIGHTS_NM = (0.0, 1000.0)
 

@@ -17,8 +17,8 @@ from scipy.ndimage import gaussian_filter, shift
 import iscat_analysis as ia
 from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import Calibration, Config
-from iscat_analysis.inference.noise import conditional
-from iscat_analysis.inference.noise_models import CONDITIONAL
+from iscat_analysis.inference.counts import conditional
+from iscat_analysis.inference.laws import CONDITIONAL
 from iscat_analysis.instrument import learning
 from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.learning import learn_optics

@@ -11,8 +11,8 @@ import pytest
 from iscat_analysis.bounds import event_bounds
 from iscat_analysis.config import Config, config_to_toml, configure, load_config
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise import conditional
 from iscat_analysis.instrument.microscope import goodness
 from iscat_analysis.instrument.particle_image import ParticleImage, place_particle_images
 from iscat_analysis.instrument.template import fit_own, fit_picture
@@ -60,8 +60,8 @@ def test_a_sampled_picture_is_the_model_between_the_samples() -> None:
     measured = with_template(truth, _sampled(truth, 4000.0))
     grid = PixelGrid.centred(15, PIXEL)
     place = (31.7, -12.3, truth.height_nm, 1e-3)
-    true, rate = truth.amplitude_gradient(grid, *place)
-    found, slope = measured.amplitude_gradient(grid, *place)
+    true, rate = truth.signal(grid, place)
+    found, slope = measured.signal(grid, place)
     top = np.abs(true).max()
     np.testing.assert_allclose(found, true, atol=2e-5 * top)
     np.testing.assert_allclose(slope[[0, 1, 3]], rate[[0, 1, 3]], atol=1e-3 * np.abs(rate[3]).max())

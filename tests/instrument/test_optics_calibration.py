@@ -19,7 +19,6 @@ from iscat_analysis.instrument.measure import HELD_OUT_P, Measured, OpticsSearch
 from iscat_analysis.instrument.microscope import build_microscope
 from iscat_analysis.instrument.particle_image import average_particle_images
 from iscat_analysis.optics.forward import ForwardModel
-from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.parameters import (
     PARAMETERS,
     are_told,
@@ -27,6 +26,7 @@ from iscat_analysis.optics.parameters import (
     prior_of,
     settings_of,
 )
+from iscat_analysis.optics.pixels import PixelGrid
 
 SIGMAS = 4.0
 """A parameter farther from the truth than this many standard errors is wrong: 6e-5 by chance."""

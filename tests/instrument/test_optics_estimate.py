@@ -10,19 +10,19 @@ from calibrations import GRID, configuration, make_particle_images, microscope
 
 from iscat_analysis.config import config_to_toml, parse_config
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.laws import CONDITIONAL, POISSON, NoiseLaw
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.noise_models import CONDITIONAL, POISSON, NoiseModel
 from iscat_analysis.instrument.joint_fit import _Point, _walls, maximise
 from iscat_analysis.instrument.particle_image import PRIVATE, ParticleImage, average_particle_images
 from iscat_analysis.instrument.starts import search_starts
-from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.parameters import free_groups, optics_limits, settings_of, with_settings
+from iscat_analysis.optics.pixels import PixelGrid
 
 NAMES = ("focus_nm", "na", "reference_phase_deg", "z7", "z11")
 
 
 @pytest.mark.parametrize("noise", [CONDITIONAL, POISSON])
-def test_pixel_terms_are_derivatives(noise: NoiseModel) -> None:
+def test_pixel_terms_are_derivatives(noise: NoiseLaw) -> None:
     random = np.random.default_rng(3)
     signal = random.normal(0, 0.05, (6, 7))
     data = np.ones((4, 6, 7))
@@ -31,7 +31,7 @@ def test_pixel_terms_are_derivatives(noise: NoiseModel) -> None:
         data[1], data[2], data[3] = data[0] + random.poisson(1000, (6, 7)), 0.9, 0.97
     else:
         data[1], data[2], data[3] = 880.0, 880.0, 4.0
-    _, score, _, by_signal, by_level = noise.terms(data, signal, 0.02)
+    terms = noise.terms(data, signal, 0.02)
 
     def value(change: np.ndarray, level: float) -> float:  # type: ignore[type-arg]
         return noise.terms(data, signal + change, level)[0]
@@ -40,10 +40,10 @@ def test_pixel_terms_are_derivatives(noise: NoiseModel) -> None:
     push = np.zeros(signal.shape)
     push[2, 3] = step
     slope = (value(push, 0.02) - value(-push, 0.02)) / (2 * step)
-    assert slope == pytest.approx(float((score * by_signal)[2, 3]), rel=1e-6)
+    assert slope == pytest.approx(float(terms.score[2, 3]), rel=1e-6)
     nothing = np.zeros(signal.shape)
     slope = (value(nothing, 0.02 + step) - value(nothing, 0.02 - step)) / (2 * step)
-    assert slope == pytest.approx(float((score * by_level).sum()), rel=1e-5)
+    assert slope == pytest.approx(float((terms.score * terms.by_level).sum()), rel=1e-5)
 
 
 def test_value_is_that_of_the_likelihood_of_fits() -> None:

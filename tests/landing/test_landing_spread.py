@@ -16,8 +16,8 @@ from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.run import Run
+from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.noise import conditional
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import FRAME_COLUMN, Candidate

@@ -12,12 +12,11 @@ from scipy.special import roots_legendre
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.context import AnalysisContext, make_context
-from iscat_analysis.inference.noise import asimov_poisson
+from iscat_analysis.inference.counts import asimov_poisson
 from iscat_analysis.instrument.microscope import build_microscope
 from iscat_analysis.instrument.particle_image import ParticleImage
-from iscat_analysis.optics.field_map import WEIGHTS, Spot
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.optics.local import LocalModels
+from iscat_analysis.optics.local import WEIGHTS, LocalModels, Spot
 from iscat_analysis.optics.parameters import FIELD, settings_of
 from iscat_analysis.study import Movie
 
@@ -187,13 +186,11 @@ def test_derivatives_of_partly_coherent_light_are_those_of_its_picture() -> None
     image = model.amplitude_image(GRID, *place, amplitude)
     peak = np.abs(image).max()
     assert np.abs(signal - image).max() < 1e-6 * peak
-    gradient = model.amplitude_gradient(GRID, *place, amplitude)[1]
+    gradient = model.signal(GRID, (*place, amplitude))[1]
     second = model.amplitude_hessian(GRID, *place, amplitude)[2]
     for axis in range(3):
         step = np.eye(3)[axis] * 0.01
-        up, down = (
-            model.amplitude_gradient(GRID, *(place + sign * step), amplitude) for sign in (1, -1)
-        )
+        up, down = (model.signal(GRID, (*(place + sign * step), amplitude)) for sign in (1, -1))
         slope = (up[0] - down[0]) / 0.02
         assert np.abs(gradient[axis] - slope).max() < 1e-6 * np.abs(slope).max()
         assert np.abs(own[axis] - slope).max() < 1e-5 * np.abs(slope).max()

@@ -13,9 +13,8 @@ from golden_setups import CASES, GOLD, NAMES, PAPER, golden_config, reference_se
 from iscat_analysis.bounds import plan
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.optics.collected import collected_area_nm2
-from iscat_analysis.optics.drawing import signals_within
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.optics.model import collected_area_nm2, signals_within
 
 GOLDEN_FIELD = 1e-6  # precision promised by the golden files
 TABLE = 1e-7  # error of the radial quintic, relative to the peak

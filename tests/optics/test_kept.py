@@ -7,7 +7,7 @@ from threading import Barrier, Event
 
 import pytest
 
-from iscat_analysis.optics.memoize import memoize
+from iscat_analysis.last_used import memoize
 
 
 def test_threads_that_want_the_same_wait_for_one() -> None:

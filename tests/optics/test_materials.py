@@ -8,7 +8,7 @@ import pytest
 
 from iscat_analysis.config import Particle
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.optics.materials import material
+from iscat_analysis.optics.scatterers import material
 from iscat_analysis.units import sphere_mass_kda
 
 _EV_NM = 1239.841984

@@ -19,10 +19,15 @@ import iscat_analysis as ia
 from iscat_analysis.bounds import event_bounds, quantum_information
 from iscat_analysis.bounds.experiment import bounds_report, plan
 from iscat_analysis.config import Config, configure
-from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.optics.materials import material
-from iscat_analysis.optics.spheres import Sphere, amplitudes, coefficients, scattering_length_nm
+from iscat_analysis.optics.model import collected_area_nm2
+from iscat_analysis.optics.scatterers import (
+    Sphere,
+    amplitudes,
+    coefficients,
+    material,
+    scattering_length_nm,
+)
 from iscat_analysis.records import PARAMETERS, with_diameters
 from iscat_analysis.report.answer import as_diameters
 from iscat_analysis.trust.assumed import assumed_error
@@ -150,7 +155,7 @@ def test_derivatives_are_those_of_the_picture() -> None:
     mass = model.material.mass_kda
     theta = np.array([35.0, -20.0, 130.0, mass])
     _, gradient, hessian = model.amplitude_hessian(GRID, *map(float, theta))
-    _, first = model.amplitude_gradient(GRID, *map(float, theta))
+    _, first = model.signal(GRID, theta[:4])
     for k, step in enumerate((2.0, 2.0, 2.0, 0.01 * mass)):
         moved = []
         for times in (-2, -1, 1, 2):
@@ -165,9 +170,7 @@ def test_derivatives_are_those_of_the_picture() -> None:
             below, above = theta.copy(), theta.copy()
             below[i] -= step / 2
             above[i] += step / 2
-            slopes = [
-                model.amplitude_gradient(GRID, *map(float, at))[1][j] for at in (below, above)
-            ]
+            slopes = [model.signal(GRID, at)[1][j] for at in (below, above)]
             bend = (slopes[1] - slopes[0]) / step
             assert np.abs(hessian[i, j] - bend).max() < 1e-3 * np.abs(bend).max()
 

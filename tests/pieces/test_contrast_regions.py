@@ -11,11 +11,10 @@ import pytest
 from scipy.stats import binom, chi2, norm
 
 import iscat_analysis as ia
-from iscat_analysis.inference.noise import gaussian
+from iscat_analysis.inference.counts import gaussian
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pieces.counts import gather
+from iscat_analysis.pieces.counts import config_of, gather
 from iscat_analysis.pieces.regions import FALSE_ALARMS_PER_REGION
-from iscat_analysis.pieces.setups import config_of
 
 OPTICS = ia.Optics(na=1.42, wavelength_nm=525, focus_nm=-500)
 CAMERA = ia.Camera(pixel_size_nm=84.4)

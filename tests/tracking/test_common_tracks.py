@@ -86,7 +86,7 @@ def test_information_lost_is_that_of_all_parameters(
         first = [round(c / PIXEL_NM - (ROI - 1) / 2) for c in theta[1::-1]]
         seen = np.zeros(SHAPE)
         seen[first[0] : first[0] + ROI, first[1] : first[1] + ROI] = 1.0
-        signal, slopes = model.amplitude_gradient(grid, *theta[:4])
+        signal, slopes = model.signal(grid, theta[:4])
         change = slopes[3] * seen
         own = own + np.sum(ground.level * change**2 / (1 + signal))
         across = across + ground.level * change / ground.level  # ∂λ/∂a ∂λ/∂B / λ
@@ -142,7 +142,7 @@ def _whole(
     for one, theta in zip(slopes, rows.theta, strict=True):
         r, c = (round(place / PIXEL_NM - (ROI - 1) / 2) for place in theta[1::-1])
         square = slice(max(r, 0), r + ROI), slice(max(c, 0), c + ROI)
-        gradient = model.amplitude_gradient(grid, *theta[:4])[1]
+        gradient = model.signal(grid, theta[:4])[1]
         one[:, *square] = (ground.level * gradient[index])[:, *square]
     own = np.linalg.inv(judged.fisher[:, index][:, :, index])
     follow = own @ slopes.reshape(len(own), 3, -1)

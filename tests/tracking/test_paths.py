@@ -7,8 +7,8 @@ import pytest
 from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.optics.blur import blurred
 from iscat_analysis.optics.forward import PixelGrid, forward_model
+from iscat_analysis.optics.model import blurred
 from iscat_analysis.tracking.frame_search import link
 from iscat_analysis.tracking.paths import SKEW, SKEW_ACROSS, path_covariance
 
@@ -34,7 +34,7 @@ def test_paths_scatter_fits_as_said(z_nm: float) -> None:
     amplitude = model.scale.amplitude(20.0)
     grid = PixelGrid.centred(ROI | 1, PIXEL_NM)
     still = blurred(model, VARIANCE_NM2, upwards=True)
-    signal, slopes = still.amplitude_gradient(grid, 0.0, 0.0, z_nm, amplitude)
+    signal, slopes = still.signal(grid, (0.0, 0.0, z_nm, amplitude))
     weight = 1 / (1 + signal)
     fisher = np.einsum("ayx,byx,yx->ab", slopes, slopes, weight)
     pinned = np.linalg.inv(fisher) @ np.einsum("ayx,yx->ayx", slopes, weight).reshape(4, -1)

@@ -14,14 +14,15 @@ from report_factory import make_analysis
 from scenes import PIXEL_NM, make_config
 from scipy.stats import norm
 
-from iscat_analysis.inference import noise
-from iscat_analysis.inference.empirical_spread import EmpiricalSpread, pooled
+from iscat_analysis.inference import counts as noise
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.split_frames import (
+from iscat_analysis.inference.repeats import (
     LENGTHS,
     PARTS,
+    EmpiricalSpread,
     Series,
+    pooled,
     repeats_of,
     response_of,
     series_of,
@@ -154,7 +155,7 @@ def test_frames_that_are_left_out_do_not_count() -> None:
 def _empty(shape: tuple[int, int] = (96, 96), level: bool = True) -> tuple[EmptyField, int]:
     model = forward_model(make_config(), 4000.0)
     grid = PixelGrid.centred(33, PIXEL_NM)
-    _, first = model.amplitude_gradient(grid, 0.0, 0.0, 5.0, 1000.0)
+    _, first = model.signal(grid, (0.0, 0.0, 5.0, 1000.0))
     slopes = first[[0, 1, 3]]
     if level:
         slopes = np.concatenate([slopes, np.ones((1, 33, 33))])

@@ -18,7 +18,7 @@ from iscat_analysis.calibration import as_given, contrast_over, standards_of, wi
 from iscat_analysis.config import Config, config_to_toml, configure
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import counts_likelihood
-from iscat_analysis.inference.noise_models import CONDITIONAL
+from iscat_analysis.inference.laws import CONDITIONAL
 from iscat_analysis.optics.forward import PixelGrid, forward_model, signed_peak
 from iscat_analysis.records import EVENT_COLUMNS, Status
 from iscat_analysis.trust.budget import budget_of, explained_kda, width_warning

@@ -23,9 +23,8 @@ from iscat_analysis.config import (
     configure,
 )
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.inference.counts import counts_likelihood
-from iscat_analysis.inference.noise import conditional
-from iscat_analysis.inference.noise_models import CONDITIONAL
+from iscat_analysis.inference.counts import conditional, counts_likelihood
+from iscat_analysis.inference.laws import CONDITIONAL
 from iscat_analysis.instrument.joint_fit import Estimate, maximise
 from iscat_analysis.instrument.microscope import build_microscope
 from iscat_analysis.instrument.particle_image import ParticleImage

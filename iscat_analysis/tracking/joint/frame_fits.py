@@ -17,7 +17,7 @@ from iscat_analysis._kernels.lens import LatticeLens, RoundLens, StampLens
 from iscat_analysis._kernels.moving import Room, Search, fit_frames
 from iscat_analysis._kernels.radial import POWERS
 from iscat_analysis._kernels.scoring import maximize
-from iscat_analysis.inference.noise_models import POISSON
+from iscat_analysis.inference.laws import POISSON
 from iscat_analysis.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]

@@ -8,8 +8,8 @@ import numpy as np
 
 from iscat_analysis._kernels.canvas import Pictures
 from iscat_analysis._kernels.lens import RoundLens
-from iscat_analysis.optics.blur import blurred, spreads
 from iscat_analysis.optics.forward import ForwardModel
+from iscat_analysis.optics.model import blurred, spreads
 from iscat_analysis.optics.stamp import BAND, RINGS, sample_picture, weights_between
 from iscat_analysis.optics.waves import axial_table
 from iscat_analysis.records import FloatArray
