@@ -15,10 +15,10 @@ from iscat_analysis.answers.calibrations import contrast_peaks, mass_calibration
 from iscat_analysis.calibration import ContrastPeak, MassCalibration
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import path_beside
-from iscat_app.calibrations import Taken
 from iscat_app.chosen import Chosen, Notice, in_line, masses_in, table_of
 from iscat_app.files import listed
 from iscat_app.runs import Job, Kind, Queue
+from iscat_app.settings import Taken
 
 _HEAD = ("standard [kDa]", "contrast", "±", "by the line [kDa]", "95 %", "residual [%]")
 _NO_DARK = "(none)"

@@ -1,18 +1,76 @@
-"""Layers of files: movies, read a frame at a time, and results beside their movie."""
+"""Layers of files: movies, whose frames are made when they are looked at, and results."""
 
 from __future__ import annotations
 
 import contextlib
+import weakref
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
-from iscat_analysis import DataError, Status, StoredResult, open_result, open_stack, tracked_rows
+from iscat_analysis import (
+    DataError,
+    Stack,
+    Status,
+    StoredResult,
+    open_result,
+    open_stack,
+    tracked_rows,
+)
 from iscat_analysis.pipeline.preview import film_limits
 from iscat_analysis.report.figures import SHOWN_FRAMES
-from iscat_napari.frames import LazyMovie
+
+
+class LazyFrames:
+    """What a viewer takes for an array (t, y, x): each frame is made when it is asked for."""
+
+    ndim = 3
+
+    def __init__(
+        self, shape: tuple[int, int, int], dtype: Any, frame: Callable[[int], NDArray[Any]]
+    ) -> None:
+        self.shape = shape
+        self.dtype = np.dtype(dtype)
+        self._frame = frame
+
+    @property
+    def size(self) -> int:
+        """How many numbers it holds."""
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, key: Any) -> NDArray[Any]:
+        wanted, *rest = key if isinstance(key, tuple) else (key,)
+        if wanted is Ellipsis:
+            wanted, rest = slice(None), [Ellipsis, *rest]
+        numbers = np.arange(self.shape[0])[wanted]
+        if np.ndim(numbers) == 0:
+            one: NDArray[Any] = np.asarray(self._frame(int(numbers)))[tuple(rest)]
+            return one
+        out = np.empty((len(numbers), *self.shape[1:]), dtype=self.dtype)
+        for place, number in enumerate(numbers):
+            out[place] = self._frame(int(number))
+        several: NDArray[Any] = out[(slice(None), *rest)]
+        return several
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.asarray(self[:], dtype=dtype)
+
+
+class LazyMovie(LazyFrames):
+    """The counts of an open movie; it is closed when nothing shows it any more."""
+
+    def __init__(self, stack: Stack) -> None:
+        super().__init__(stack.shape, stack.dtype, lambda t: stack.read(t, t + 1)[0])
+        self.stack = stack
+        weakref.finalize(self, stack.close)
+
 
 LayerData = tuple[Any, dict[str, Any], str]
 """Data, options and kind of a layer, as napari takes them."""

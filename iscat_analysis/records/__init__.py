@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from iscat_analysis.config import PARAMETERS
 from iscat_analysis.records.analysis import Analysis, Clip, EventView, Film, Provenance, Trace
-from iscat_analysis.records.arrays import BoolArray, FloatArray, Mapper, Progress, silent
 from iscat_analysis.records.columns import (
     BUDGET_COLUMNS,
     DIPOLE,
@@ -20,15 +19,6 @@ from iscat_analysis.records.columns import (
     free_parameters,
     track_numbers,
 )
-from iscat_analysis.records.fits import Alternative, Box, Candidate, FitResult, PosteriorResult
-from iscat_analysis.records.frames import (
-    CountSource,
-    FrameSource,
-    InPlace,
-    PlacedSource,
-    StackMetadata,
-    Windows,
-)
 from iscat_analysis.records.rows import (
     POOR_P,
     Tally,
@@ -43,7 +33,29 @@ from iscat_analysis.records.rows import (
     tally,
     with_diameters,
 )
-from iscat_analysis.records.verdicts import NO_EVENT, SEVERITY, Status, TrackStatus, verdict
+from iscat_analysis.records.steps import (
+    NO_EVENT,
+    SEVERITY,
+    Alternative,
+    BoolArray,
+    Box,
+    Candidate,
+    CountSource,
+    FitResult,
+    FloatArray,
+    FrameSource,
+    InPlace,
+    Mapper,
+    PlacedSource,
+    PosteriorResult,
+    Progress,
+    StackMetadata,
+    Status,
+    TrackStatus,
+    Windows,
+    silent,
+    verdict,
+)
 
 __all__ = [
     "BUDGET_COLUMNS",

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.config import MODES, SCHEMES, ModeKind, SchemeKind
 from iscat_analysis.findings import Finding, warnings_in
-from iscat_analysis.records.arrays import FloatArray
-from iscat_analysis.records.fits import PosteriorResult
+from iscat_analysis.records.steps import FloatArray, PosteriorResult
 
 
 @dataclass(frozen=True)

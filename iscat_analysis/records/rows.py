@@ -1,4 +1,4 @@
-"""Make the rows of ``fits.csv`` from the results of events."""
+"""Rows of the tables: how they are made, judged and counted."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import numpy as np
 import pandas as pd
 from scipy.special import bdtrc
 
-from iscat_analysis.records.arrays import BoolArray
 from iscat_analysis.records.columns import EVENTS
-from iscat_analysis.records.verdicts import NO_EVENT, SEVERITY, Status, TrackStatus
+from iscat_analysis.records.steps import NO_EVENT, SEVERITY, BoolArray, Status, TrackStatus
 from iscat_analysis.units import count, sphere_diameter_nm
 
 POOR_P = 0.01

@@ -19,16 +19,14 @@ from iscat_analysis.report.answer import answer_in
 pytest.importorskip("panel", reason="needs the Python package panel")
 
 from iscat_app.calibrate import Calibrate
-from iscat_app.calibrations import beside, take
 from iscat_app.chosen import Chosen, table_of
 from iscat_app.compare import Compare
 from iscat_app.export import Export
 from iscat_app.files import Files, listed, result_facts
 from iscat_app.form import FIRST, Form, fields
-from iscat_app.rejections import Rejections
-from iscat_app.results import Results
+from iscat_app.results import Rejections, Results
 from iscat_app.runs import Job, Queue
-from iscat_app.setup_file import add_table, read_texts, write_texts
+from iscat_app.settings import add_table, beside, read_texts, take, write_texts
 from iscat_cli import main
 
 

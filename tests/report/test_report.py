@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from iscat_analysis.config import load_config, parse_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.findings.results import NOT_A_MASS
+from iscat_analysis.notebook import Result
 from iscat_analysis.pipeline.stored import open_result
 from iscat_analysis.records import EVENT_COLUMNS, Analysis, Status, tally
 from iscat_analysis.report import check_output, figures, render_page, render_report, write_report
@@ -31,7 +32,6 @@ from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder
 from iscat_analysis.report.page import Chart, Section, render_document
 from iscat_analysis.report.style import new_figure, publish
 from iscat_analysis.report.tables import event_table
-from iscat_analysis.result import Result
 from iscat_analysis.schemas import jsonable
 from iscat_analysis.species import describe
 

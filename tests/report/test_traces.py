@@ -13,6 +13,7 @@ from PIL import Image
 from report_factory import make_analysis, with_traces
 
 from iscat_analysis.fitting.run import packed, unpacked
+from iscat_analysis.notebook import Result
 from iscat_analysis.records import Clip, EventView, Trace
 from iscat_analysis.report.event_figures import (
     CLIP_MS,
@@ -22,7 +23,6 @@ from iscat_analysis.report.event_figures import (
     trace_words,
 )
 from iscat_analysis.report.tables import event_table
-from iscat_analysis.result import Result
 
 
 def _trace(frames: int = 300, *, first: int = 100, turn: int = 250) -> Trace:

@@ -14,10 +14,10 @@ from report_factory import make_analysis
 from walkers import EXPOSURE_MS, RATE_HZ, fits_of, walk
 
 from iscat_analysis.findings.results import NOT_A_MASS
+from iscat_analysis.notebook import Result
 from iscat_analysis.records import FREE_PARAMETERS, TRACK_COLUMNS, free_parameters
 from iscat_analysis.report import event_figures, render_report, track_figures, write_report
 from iscat_analysis.report.answer import headline
-from iscat_analysis.result import Result
 
 
 def test_a_page_of_tracks_shows_paths_masses_speeds_and_films(tmp_path: Path) -> None:

@@ -160,7 +160,7 @@ def test_a_movie_is_read_a_frame_at_a_time(viewer, folder: Path, monkeypatch) ->
 
 
 def test_a_movie_is_closed_when_nothing_shows_it(folder: Path) -> None:
-    from iscat_napari.frames import LazyMovie
+    from iscat_napari.readers import LazyMovie
 
     stack = ia.open_stack(folder / "movie.tif")
     frames = LazyMovie(stack)

@@ -1,0 +1,515 @@
+"""Records between steps: movies and sums of their frames, candidates, fits, verdicts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+Mapper = Callable[..., Iterable[Any]]
+"""`map`, or the one of a pool."""
+
+
+class Progress(Protocol):
+    """Callback for the progress of a step; the command line draws a bar on stderr."""
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        """Report that `done` of `total` steps of `stage` are finished."""
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """Ignore progress."""
+
+
+class Status(StrEnum):
+    """The verdict on one fit; `advice` says what each asks of the user."""
+
+    OK = "ok"
+    NOT_CONVERGED = "not_converged"
+    AT_BOUND = "at_bound"
+    AMBIGUOUS_Z = "ambiguous_z"
+    AMBIGUOUS_SIZE = "ambiguous_size"
+    AMBIGUOUS_DIRECTION = "ambiguous_direction"
+    POOR_FIT = "poor_fit"
+    TOO_CLOSE = "too_close"
+    SATURATED = "saturated"
+    UNCALIBRATED_OPTICS = "uncalibrated_optics"
+    SIDELOBE = "sidelobe"
+    NOT_DETECTED = "not_detected"
+    NONLINEAR = "nonlinear"
+    PROCESSED = "processed"
+    CHANGING = "changing"
+    EXTENDED = "extended"
+    LARGE = "large"
+
+    @property
+    def advice(self) -> str:
+        """What the status means and what to try."""
+        return _ADVICE[self]
+
+
+_ADVICE = {
+    Status.OK: "The fit converged, inside its bounds, and agrees with the data.",
+    Status.NOT_CONVERGED: "The fit did not converge: check the optics, or enlarge fit.roi_nm.",
+    Status.AT_BOUND: "The best value of a parameter is beyond its bound: of a height (widen "
+    "fit.z_range_nm; at the coverslip check optics.focus_nm and the indices), of a position (no "
+    "particle there, or wrong optics), or of a mass (below a calibration.offset).",
+    Status.AMBIGUOUS_Z: "Another height explains the data almost as well: use more frames, "
+    "another focus, or a narrower fit.z_range_nm.",
+    Status.AMBIGUOUS_SIZE: "Another diameter explains the data almost as well: use more frames, "
+    "another focus, or a narrower fit.diameter_range_nm.",
+    Status.AMBIGUOUS_DIRECTION: "Another direction of a rod explains the data almost as well: use "
+    "more frames, another focus or another polarisation.",
+    Status.POOR_FIT: "The model does not describe the data: check focus, NA, pixel size, gain and "
+    "neighbours; a large particle that fit.spheres does not describe needs mode size.",
+    Status.TOO_CLOSE: "Another particle is nearer than detection.min_separation_nm: "
+    "treat the mass as shared between them.",
+    Status.SIDELOBE: "Not larger than the residual of a brighter particle beside it, and not "
+    "counted: check focus, NA and aberrations to tell whether it is a particle.",
+    Status.NOT_DETECTED: "No particle stands out from the noise of the region, as noise alone does "
+    "in at most 1 of 100 regions: use more frames or more light, or check where it was cut out.",
+    Status.UNCALIBRATED_OPTICS: "The contrast is right, but the mass scale was measured with "
+    "other optics: measure standards with these optics (iscat calibrate mass).",
+    Status.SATURATED: "The camera is saturated here: lower the exposure or the laser power.",
+    Status.PROCESSED: "The frames were interpolated, smoothed or sharpened, which changes their "
+    "noise and their particles: analyse the raw frames of the camera.",
+    Status.NONLINEAR: "The counts of the whole movie are not in proportion to its light, so that "
+    "all masses are wrong by the same factor: a line says by how much and why.",
+    Status.CHANGING: "The light of the particle changes beside its step: the particle settles, "
+    "bleaches, blinks or moves, or another one is at the same place; the mass is that of the mean "
+    "change.",
+    Status.EXTENDED: "The image is wider than that of a point: the particle wiggles by more than "
+    "particle.wiggle_nm, or has separate parts, or the optics are not those configured; its mass "
+    "is too small.",
+    Status.LARGE: "It is no dipole, so that its contrast does not give its mass: the column model "
+    "says which sphere on the coverslip describes it, with its diameter.",
+}
+
+
+SEVERITY = (
+    Status.SIDELOBE,
+    Status.NOT_DETECTED,
+    Status.NOT_CONVERGED,
+    Status.AT_BOUND,
+    Status.LARGE,
+    Status.POOR_FIT,
+    Status.CHANGING,
+    Status.EXTENDED,
+    Status.AMBIGUOUS_SIZE,
+    Status.AMBIGUOUS_Z,
+    Status.AMBIGUOUS_DIRECTION,
+    Status.TOO_CLOSE,
+    Status.SATURATED,
+    Status.UNCALIBRATED_OPTICS,
+    Status.NONLINEAR,
+    Status.PROCESSED,
+)
+"""Flags of a fit, worst first: perhaps no particle; none above the noise; no estimate; no estimate
+inside the bounds; no dipole and so no mass; a model that does not describe the data, their change
+in time or their width; one of several diameters, heights or directions; a mass shared with a
+neighbour; pixels left out; a mass on the scale of other optics; counts that are not in proportion
+to the light; frames that were processed."""
+
+
+NO_EVENT = frozenset({Status.SIDELOBE, Status.NOT_DETECTED})
+"""Verdicts on rows that are no particles: they are in no count, histogram or species."""
+
+
+def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:
+    """Sort the flags of a fit; the status is the worst one."""
+    ordered = tuple(sorted(set(flags) - {Status.OK}, key=SEVERITY.index))
+    return (ordered[0] if ordered else Status.OK), ordered
+
+
+class TrackStatus(StrEnum):
+    """The verdict on one track; worst first."""
+
+    FEW_FRAMES = "few_frames"
+    POOR_FITS = "poor_fits"
+    AMBIGUOUS_SIZE = "ambiguous_size"
+    OTHER_PARTICLE = "other_particle"
+    MASS_VARIES = "mass_varies"
+    PARTLY_SEEN = "partly_seen"
+    SHORT_WAY = "short_way"
+    NOT_FREE = "not_free"
+    STANDS_STILL = "stands_still"
+    NEAR_WALL = "near_wall"
+    UNCALIBRATED_OPTICS = "uncalibrated_optics"
+    OK = "ok"
+
+    @property
+    def advice(self) -> str:
+        """What the status means and what to try."""
+        return _TRACK_ADVICE[self]
+
+
+_TRACK_ADVICE = {
+    TrackStatus.OK: "The frames agree on one mass, and the particle diffuses freely.",
+    TrackStatus.FEW_FRAMES: "Fewer of its positions than track.min_frames can be used (those at "
+    "the border of the field, too close to another particle or not converged cannot): no "
+    "diffusion coefficient.",
+    TrackStatus.POOR_FITS: "Fewer than half of its frames are ok, so that poor fits are used too; "
+    "its errors are enlarged by the factor by which the masses of its frames scatter beyond theirs "
+    "(mass_scatter): see the status of its rows in fits.csv.",
+    TrackStatus.AMBIGUOUS_SIZE: "Another diameter explains all its frames almost as well: "
+    "optical_probability says how likely this one is.",
+    TrackStatus.OTHER_PARTICLE: "Its images and its motion are those of a homogeneous sphere of "
+    "another refractive index rather than of the particle of [particle], so that its optical "
+    "diameter is wrong: give [particle] its refractive_index, or its shell.",
+    TrackStatus.MASS_VARIES: "Its frames differ in mass by more than their errors, or the masses "
+    "of all tracks change together: motion blurs the image, particles met, the particle changed, "
+    "or the focus drifts.",
+    TrackStatus.PARTLY_SEEN: "It is seen in some of the frames only, but moves too slowly to have "
+    "gone far in the others: there the background contains it, and its mass is too small; record "
+    "for longer, or give background frames without it.",
+    TrackStatus.SHORT_WAY: "It moved so little that it can hardly be told from the background "
+    "learnt with it: mass and D are wrong together, D as the mass to the power of -2; record for "
+    "longer, or give background frames without it.",
+    TrackStatus.NOT_FREE: "It does not diffuse freely: p_confinement, p_anomalous and p_steady "
+    "say in which way; D is that of free diffusion.",
+    TrackStatus.STANDS_STILL: "Its D is not above zero within its error: take d_high_um2_s as an "
+    "upper limit, or record for longer.",
+    TrackStatus.NEAR_WALL: "The coverslip slows it by more than 5 %: its diameter is too large, "
+    "its index too small.",
+    TrackStatus.UNCALIBRATED_OPTICS: Status.UNCALIBRATED_OPTICS.advice,
+}
+
+
+@dataclass(frozen=True)
+class StackMetadata:
+    """Metadata of a movie file; None where the file has no value.
+
+    Attributes
+    ----------
+    pixel_size_nm : float or None
+        In the sample plane [nm].
+    exposure_ms : float or None
+        Exposure of one frame [ms].
+    frame_rate_hz : float or None
+        Frames per second [Hz]; the camera's own, where frames are missing.
+    ticks : tuple of int or None
+        Number of camera intervals from the first frame to each frame, shape (t,), if frames are
+        missing; None if none is missing or this is not known.
+    gain_e_per_adu : float or None
+        Photoelectrons per count, from the camera's driver.
+    offset_adu : float or None
+        Counts in the dark, from the camera's driver.
+    wavelength_nm : float or None
+        Of the illumination, in vacuum [nm].
+    na : float or None
+        Numerical aperture of the objective.
+    magnification : float or None
+        Of the objective, as engraved.
+    binning : float or None
+        Pixels of the sensor along a side of one of the movie.
+    displayed_hz : float or None
+        Frames per second at which ImageJ shows the movie [Hz]; the camera may have been faster.
+    source : str
+        Source of the metadata: ``"ome"``, ``"imagej"``, ``"micromanager"``, ``"tiff"``, the name
+        of a file beside it, ``"none"``…
+    """
+
+    pixel_size_nm: float | None = None
+    exposure_ms: float | None = None
+    frame_rate_hz: float | None = None
+    ticks: tuple[int, ...] | None = None
+    gain_e_per_adu: float | None = None
+    offset_adu: float | None = None
+    wavelength_nm: float | None = None
+    na: float | None = None
+    magnification: float | None = None
+    binning: float | None = None
+    displayed_hz: float | None = None
+    source: str = "none"
+
+
+class FrameSource(Protocol):
+    """A movie that is read a few frames at a time."""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows, columns."""
+
+    @property
+    def name(self) -> str:
+        """Name in messages."""
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Frames ``[start, stop)`` as stored, shape (stop − start, y, x) [counts]."""
+
+
+@dataclass(frozen=True)
+class InPlace:
+    """Memory-mapped frames of a file, which are read-only.
+
+    Attributes
+    ----------
+    counts : ndarray, shape (t, y, x)
+        The stored counts; they may be used as long as `check` does not raise.
+    check : callable
+        Raises DataError if the file has become shorter: reading beyond its end kills the process.
+    let_go : callable
+        Releases the memory of all frames; they are read from the file again when they are used.
+    """
+
+    counts: NDArray[Any]
+    check: Callable[[], None]
+    let_go: Callable[[], None]
+
+
+class CountSource(FrameSource, Protocol):
+    """A movie and the type of its numbers."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the stored counts."""
+
+
+@runtime_checkable
+class PlacedSource(Protocol):
+    """A movie whose frames can be memory-mapped."""
+
+    def in_place(self, start: int, stop: int) -> InPlace | None:
+        """Frames ``[start, stop)`` without a copy; None where they have to be read."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Photoelectrons summed before and after the particles bound.
+
+    The raw counts are summed, never rescaled frames, so that both sums stay Poisson; laser power
+    enters through `power_ratio` alone (physics.md, section 4).
+
+    Attributes
+    ----------
+    before_e, after_e : ndarray, shape (y, x)
+        Summed photoelectrons [e].  With a known background `before_e` is its expectation for
+        `n_before` = 1 frame.
+    n_before, n_after : int
+        Frames in each sum; `n_before` = 0 where the background is known.
+    power_ratio : float
+        ρ, total power after over total power before.
+    read_variance_before_e2, read_variance_after_e2 : ndarray, shape (y, x)
+        Read-noise variance of each sum [e²].
+    masked : ndarray of bool, shape (y, x)
+        Pixels that must not be used: dead, hot or saturated.
+    saturated : ndarray of bool, shape (y, x)
+        The saturated ones among them.
+    frames_before, frames_after : (int, int)
+        The half-open frame ranges.
+    power : ndarray, shape (t,)
+        Power of every frame in both ranges over the mean power before; before first.
+    """
+
+    before_e: FloatArray
+    after_e: FloatArray
+    n_before: int
+    n_after: int
+    power_ratio: float
+    read_variance_before_e2: FloatArray
+    read_variance_after_e2: FloatArray
+    masked: BoolArray
+    saturated: BoolArray
+    frames_before: tuple[int, int]
+    frames_after: tuple[int, int]
+    power: FloatArray
+
+    @property
+    def left_out(self) -> tuple[int, int]:
+        """Numbers of dead, hot or noisy pixels, and of saturated ones."""
+        defects = self.masked & ~self.saturated
+        return int(defects.sum()), int(self.saturated.sum())
+
+    def cut(self, region: tuple[slice, slice]) -> Windows:
+        """Give the sums of some pixels."""
+        return replace(
+            self,
+            before_e=self.before_e[region],
+            after_e=self.after_e[region],
+            read_variance_before_e2=self.read_variance_before_e2[region],
+            read_variance_after_e2=self.read_variance_after_e2[region],
+            masked=self.masked[region],
+            saturated=self.saturated[region],
+        )
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A place where the search finds a possible particle.
+
+    Attributes
+    ----------
+    x_px, y_px : float
+        Sub-pixel position; integer = pixel centre, y down the rows.
+    z_nm : float
+        Height of the template that matched best [nm].
+    mass_kda : float
+        Linear estimate of the mass [kDa]; negative where the contrast has the other sign.
+    snr : float
+        Matched-filter signal over its noise.
+    beside : float
+        Largest ratio at other places with the same distance from a known particle.
+    """
+
+    x_px: float
+    y_px: float
+    z_nm: float
+    mass_kda: float
+    snr: float
+    beside: float = 0.0
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another height that a fit converged to.
+
+    Attributes
+    ----------
+    z_nm : float
+        The height [nm].
+    log_likelihood_gap : float
+        Log-likelihood of the best height minus that of this one, ≥ 0.
+    mass_kda : float
+        The mass [kDa]: in mode size, another diameter may have another mass.
+    """
+
+    z_nm: float
+    log_likelihood_gap: float
+    mass_kda: float = math.nan
+
+
+@dataclass(frozen=True)
+class Box:
+    """Bounds of θ = (x, y, z, amplitude, level) and which of them are free.
+
+    Attributes
+    ----------
+    free : ndarray of bool, shape (5,)
+        Free parameters.
+    lower, upper : ndarray, shape (5,)
+        Bounds [nm, amplitude, 1].
+    """
+
+    free: BoolArray
+    lower: FloatArray
+    upper: FloatArray
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """One maximum-likelihood fit.
+
+    Attributes
+    ----------
+    x_nm, y_nm, z_nm, mass_kda : float
+        Estimate in the full frame [nm, kDa]; a parameter that was not free holds its fixed value.
+    theta : ndarray, shape (5,)
+        Maximum of the likelihood, in the parameters of the likelihood.
+    estimate : ndarray, shape (5,)
+        The maximum minus the bias of order 1/N; the estimates above are computed from it.
+    box : Box
+        Bounds of the search.
+    free : tuple of str
+        Names of the free parameters, a subset of `PARAMETERS` in that order.
+    sigma : ndarray, shape (4,)
+        Standard deviations from the observed information, in the order of `PARAMETERS`;
+        NaN where not free.  With few photons, those of positions follow from the likelihood three
+        errors away, if this is larger; see `iscat_analysis.inference.fit.reach`.
+    covariance : ndarray, shape (n_free, n_free)
+        Inverse observed information, with these standard deviations.
+    contrast : float
+        Signed peak contrast of the model over the plane, at the estimate.
+    log_likelihood : float
+        At its maximum, without terms that do not depend on the parameters.
+    snr : float
+        √(2 Δℓ) against no particle; a free level is fitted in both.
+    iterations : int
+        Scoring steps taken by the best start.
+    chi2_reduced, p_value : float
+        Goodness of fit of the fitted pixels.
+    status : Status
+        The verdict.
+    flags : tuple of Status
+        All flags, worst first, including the status unless it is ok.
+    alternatives : tuple of Alternative
+        Other heights, best first.
+    sigma_index : float
+        Standard deviation of the refractive index of a sphere, where it was fitted.
+    size_probability : float
+        Posterior probability of the diameter among all that were found; NaN where it is not free.
+    """
+
+    x_nm: float
+    y_nm: float
+    z_nm: float
+    mass_kda: float
+    theta: FloatArray
+    estimate: FloatArray
+    box: Box
+    free: tuple[str, ...]
+    sigma: FloatArray
+    covariance: FloatArray
+    contrast: float
+    log_likelihood: float
+    snr: float
+    iterations: int
+    chi2_reduced: float
+    p_value: float
+    status: Status
+    flags: tuple[Status, ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
+    sigma_index: float = math.nan
+    size_probability: float = math.nan
+
+    def shifted(self, x_nm: float, y_nm: float) -> FitResult:
+        """Give the same fit in coordinates with another origin."""
+        return replace(self, x_nm=self.x_nm + x_nm, y_nm=self.y_nm + y_nm)
+
+
+@dataclass(frozen=True)
+class PosteriorResult:
+    """An ensemble of posterior samples and the verdict on it.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Parameter names with units, as in `PARAMETERS`.
+    samples : ndarray, shape (chain, draw, parameter)
+        Draws after burn-in, one chain per walker.
+    log_likelihood : ndarray, shape (chain, draw)
+        At each draw.
+    tau : ndarray, shape (parameter,)
+        Integrated autocorrelation time [steps].
+    r_hat : ndarray, shape (parameter,)
+        Split R̂.
+    ess_bulk, ess_tail : ndarray, shape (parameter,)
+        Effective sample sizes.
+    acceptance : float
+        Mean acceptance fraction.
+    converged : bool
+        Whether every criterion holds; if not, the samples must not be reported as a posterior.
+    message : str
+        Which criterion failed, or that all hold.
+    van_trees : ndarray, shape (parameter,), or None
+        With an informative prior, the least root-mean-square error of any estimate over particles
+        of that prior [nm, kDa].
+    """
+
+    names: tuple[str, ...]
+    samples: FloatArray
+    log_likelihood: FloatArray
+    tau: FloatArray
+    r_hat: FloatArray
+    ess_bulk: FloatArray
+    ess_tail: FloatArray
+    acceptance: float
+    converged: bool
+    message: str
+    van_trees: FloatArray | None = None
