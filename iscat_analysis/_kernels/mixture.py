@@ -161,30 +161,6 @@ def mixture_sums(
 
 
 @kernel()
-def mixture_em(
-    x: FloatArray,
-    noise: FloatArray,
-    weight: FloatArray,
-    mean: FloatArray,
-    variance: FloatArray,
-    steps: int,
-) -> None:
-    """Take steps of expectation and maximisation, in place.
-
-    Shapes: `x, noise` (n,), `weight, mean, variance` (k,).
-    """
-    for _ in range(steps):
-        _, sums = mixture_sums(x, noise, weight, mean, variance)
-        for j in range(weight.size):
-            size = sums[j, 0] + 1e-12
-            shift = variance[j] * sums[j, 1] / size  # from the old mean, to avoid cancellation
-            second = variance[j] * (variance[j] * sums[j, 2] + sums[j, 4])
-            mean[j] += shift
-            variance[j] = max(second / size - shift * shift, 0.0)
-            weight[j] = size / x.size
-
-
-@kernel()
 def mixture_score(
     x: FloatArray, noise: FloatArray, weight: FloatArray, mean: FloatArray, variance: FloatArray
 ) -> tuple[float, FloatArray]:

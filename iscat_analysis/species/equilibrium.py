@@ -282,28 +282,9 @@ class _Equilibrium:
             slope[self.at + 1] -= away / LANDING_POWER_SIGMA
         return total, slope
 
-    def curvature(self, theta: FloatArray) -> FloatArray:
-        """Minus the second derivatives of the height.
-
-        Shapes: `theta` (p,), result (p, p).
-        """
-        at, constants = self.at, theta[self.at :]
-        full = self.full(theta)
-        information, by_logit = self.series.information(full), self.series.likelihood(full)[1][at:]
-        change = np.zeros((theta.size, full.size))
-        change[:at, :at] = np.eye(at)
-        change[at:, at:] = self._rise(constants)
-        found = change @ information @ change.T
-        for place, step in enumerate(_STEP * np.eye(constants.size)):
-            bend = (self._rise(constants + step) - self._rise(constants - step)) / (2 * _STEP)
-            found[at + place, at:] -= bend @ by_logit
-        if self.power is None:
-            found[at + 1, at + 1] += LANDING_POWER_SIGMA**-2
-        return np.asarray((found + found.T) / 2)
-
     def problem(self) -> Problem:
         """Give what is maximised."""
-        return Problem(self.height, self.curvature, self.low, self.high, self.scale)
+        return Problem(self.height, self.low, self.high, self.scale, self.series.events)
 
     def near(self, theta: FloatArray) -> Maximum:
         """Climb from shared parameters and a K_D that are about right.

@@ -36,23 +36,37 @@ _TOLERANCE = 0.01  # of Minuit: 1e-5 of a log-likelihood
 _INSIDE = 1e-3  # of its range that a start lies away from a limit, where Minuit sees no slope
 _AT_LIMIT = 1e-4  # of its range from a limit
 _LEAST_BEND = 1e-8  # of the largest curvature, in units of the scale
+_DIFFERENCE = 1e-3  # of about a standard error: steps for second derivatives
 _STEP = 0.02  # of the scale: the first step where second derivatives say nothing
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A function with its slope and minus its second derivatives, and its parameters' limits.
+    """A log-likelihood with its slope, the limits of its parameters, and typical steps of them.
 
-    A parameter whose limits are the same is held.
+    A parameter whose limits are the same is fixed.  `events` are as many as make the likelihood, so
+    that a standard error is about a step over their root.
 
     Shapes: `low, high, scale` (p,).
     """
 
     height: Callable[[FloatArray], tuple[float, FloatArray]]
-    curvature: Callable[[FloatArray], FloatArray]
     low: FloatArray
     high: FloatArray
     scale: FloatArray
+    events: int = 1
+
+    def curvature(self, theta: FloatArray) -> FloatArray:
+        """Observed information: minus the second derivatives, by differences of slopes.
+
+        Shapes: `theta` (p,), result (p, p).
+        """
+        steps = _DIFFERENCE * self.scale / math.sqrt(max(self.events, 1))
+        steps = np.where(theta + steps > self.high, -steps, steps)
+        here = self.height(theta)[1]
+        rise = np.array([here - self.height(theta + step)[1] for step in np.diag(steps)])
+        found = rise / steps[:, None]
+        return np.asarray((found + found.T) / 2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ from iscat_analysis.species.structure import (
     Structure,
     fit_jointly,
     free_structure,
-    information,
+    joint_problem,
     parameters,
     polish,
 )
@@ -67,7 +67,7 @@ class Possible:
     def curvature(self) -> FloatArray:
         """Give how the likelihood bends at the species (p, p)."""
         samples = [(self.events, self.structure)]
-        return information(samples, parameters(samples, [self.mixture]))
+        return joint_problem(samples).curvature(parameters(samples, [self.mixture]))
 
 
 def with_edges(

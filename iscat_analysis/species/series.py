@@ -32,7 +32,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
 from iscat_analysis._kernels.mixture import mixture_score
@@ -66,7 +65,6 @@ _NODES = 64
 _PEAK_REACH = 0.4  # of the lightest mass: events of a peak
 _SIGMA_PER_MAD = 1.4826
 _TINY = 1e-290
-_DIFFERENCE = 1e-3  # of about a standard error: steps for second derivatives
 
 
 def _segments() -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -322,13 +320,8 @@ class Series:
         odds = np.exp(theta[self.shares : self.own])[:, None]
         return np.asarray(np.hstack([species, odds]) / (1 + odds))
 
-    def _places(self, number: int) -> NDArray[np.intp]:
-        """Tell where the parameters of one table are: common ones, its share, its logits."""
-        logits = self.own + number * (self.kinds - 1) + np.arange(self.kinds - 1)
-        return np.concatenate([np.arange(self.shares), [self.shares + number], logits])
-
     def _scores(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Log-likelihood of each table, and its slopes in the parameters of `_places`.
+        """Log-likelihood of each table; its slopes in what tables share, its share and its logits.
 
         Shapes: `theta` (p,), results (tables,), (tables, shares + k).
         """
@@ -407,34 +400,10 @@ class Series:
         """
         values, slopes = self._scores(theta)
         distance = self.prior_design @ theta[: self.own] - self.prior_middle
-        slope = np.zeros(theta.shape)
-        slope[: self.own] = -self.prior_design.T @ distance
-        for number, found in enumerate(slopes):
-            slope[self._places(number)] += found
+        common, share, logits = np.split(slopes, [self.shares, self.shares + 1], axis=1)
+        slope = np.concatenate([common.sum(axis=0), share.ravel(), logits.ravel()])
+        slope[: self.own] -= self.prior_design.T @ distance
         return float(values.sum()) - 0.5 * float(distance @ distance), slope
-
-    def information(self, theta: FloatArray) -> FloatArray:
-        """Minus the second derivatives of `likelihood`, by differences of its slopes.
-
-        Tables share no share and no logit, so that one step in each table's serves all of them.
-
-        Shapes: `theta` (p,), result (p, p).
-        """
-        here = self._scores(theta)[1]
-        places = np.array([self._places(number) for number in range(self.number)])
-        found = np.zeros((theta.size, theta.size))
-        size = _DIFFERENCE * self.scale / math.sqrt(max(self.events, 1))
-        for column in range(places.shape[1]):
-            moved, at = theta.copy(), np.unique(places[:, column])
-            step = np.where(theta[at] + size[at] > self.high[at], -size[at], size[at])
-            moved[at] += step
-            steps = moved[places[:, column]] - theta[places[:, column]]
-            rise = (here - self._scores(moved)[1]) / steps[:, None]
-            for number, row in enumerate(rise):
-                found[places[number, column], places[number]] += row
-        found = (found + found.T) / 2
-        found[: self.own, : self.own] += self.prior_design.T @ self.prior_design
-        return found
 
     def turned(self, theta: FloatArray, tail: float) -> FloatArray:
         """Give peaks as wide and in the same places with another tail, on a level background.
@@ -453,4 +422,4 @@ class Series:
 
     def problem(self) -> Problem:
         """Give what is maximised where every table's weights are free."""
-        return Problem(self.likelihood, self.information, self.low, self.high, self.scale)
+        return Problem(self.likelihood, self.low, self.high, self.scale, self.events)

@@ -145,6 +145,13 @@ def parameters(
     return np.asarray(np.linalg.lstsq(np.vstack(rows), np.concatenate(values), rcond=None)[0])
 
 
+def joint_problem(samples: Sequence[tuple[Events, Structure]]) -> Problem:
+    """Make the problem of maximising the likelihood of all samples."""
+    limits, events = samples[0][1].limits, sum(events.x.size for events, _ in samples)
+    height = partial(log_likelihood, samples)
+    return Problem(height, limits.low, limits.high, limits.scale, events)
+
+
 def maximise_jointly(
     samples: Sequence[tuple[Events, Structure]],
     start: Sequence[Mixture],
@@ -154,12 +161,7 @@ def maximise_jointly(
 
     Shapes: `near` (p, p).
     """
-    limits = samples[0][1].limits
-    problem = Problem(
-        partial(log_likelihood, samples), partial(information, samples),
-        limits.low, limits.high, limits.scale,
-    )  # fmt: skip
-    return maximise(problem, parameters(samples, start), near)
+    return maximise(joint_problem(samples), parameters(samples, start), near)
 
 
 def free_structure(events: Events, start: Mixture) -> Structure:
@@ -255,24 +257,8 @@ def fit_jointly(
     )
 
 
-def information(samples: Sequence[tuple[Events, Structure]], theta: FloatArray) -> FloatArray:
-    """Observed information: minus the second derivatives of the log-likelihood.
-
-    Shapes: `theta` (p,), result (p, p).
-    """
-    limits = samples[0][1].limits
-    n = sum(events.x.size for events, _ in samples)
-    steps = _STEP * limits.scale / math.sqrt(n)
-    steps = np.where(theta + steps > limits.high, -steps, steps)
-    here = log_likelihood(samples, theta)[1]
-    rise = [log_likelihood(samples, theta + step)[1] - here for step in np.diag(steps)]
-    found = -np.array(rise) / steps[:, None]
-    return np.asarray((found + found.T) / 2)
-
-
 _HARDLY_SEEN = -1.88  # standard deviations above the threshold, where 3 % are seen
 _WIDTH_STEP = 0.3  # of ln T
-_STEP = 1e-3  # of about a standard error: steps for second derivatives
 _LEAST_WEIGHT = 1e-6  # of a component that a sample lacks, at a start
 
 _POWER, _POWER_SPREAD = 0.5, 0.5

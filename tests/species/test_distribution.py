@@ -12,7 +12,7 @@ from scipy.optimize import approx_fprime
 from scipy.special import log_ndtr, logsumexp
 from scipy.stats import ks_2samp, norm
 
-from iscat_analysis._kernels.mixture import detection_score, mixture_em, mixture_score
+from iscat_analysis._kernels.mixture import detection_score, mixture_score
 from iscat_analysis.species import (
     LEAST_EVENTS,
     SPECIES_COLUMNS,
@@ -21,6 +21,7 @@ from iscat_analysis.species import (
     Searched,
     describe,
 )
+from iscat_analysis.species.choices import ascend, height
 from iscat_analysis.species.events import Edge, Events
 from iscat_analysis.species.mixture import Mixture
 from iscat_analysis.species.repeats import draw_events
@@ -112,24 +113,21 @@ def test_a_step_of_em_is_what_its_definition_says_for_any_number_of_events() -> 
         size = share.sum(axis=0) + 1e-12
         mean = m + (share * (true - m)).sum(axis=0) / size
         square = (share * ((true - m) ** 2 + (v / (v + noise[:, None])) * noise[:, None])).sum(0)
-        found = w.copy(), m.copy(), v.copy()
-        mixture_em(x, noise, *found, 1)
-        assert found[0] == pytest.approx(size / n, rel=1e-11)
-        assert found[1] == pytest.approx(mean, rel=1e-11)
-        assert found[2] == pytest.approx(square / size - (mean - m) ** 2, rel=1e-9, abs=1e-9)
+        events = Events(x, np.sqrt(noise), None, plain=True)
+        found = ascend(events, Mixture(w, m, v), 1)
+        assert found.weight == pytest.approx(size / n, rel=1e-11)
+        assert found.mean == pytest.approx(mean, rel=1e-11)
+        assert found.variance == pytest.approx(square / size - (mean - m) ** 2, rel=1e-9, abs=1e-9)
         value, _ = mixture_score(x, noise, w, m, v)
         assert value == pytest.approx(logsumexp(density, axis=1).sum(), rel=1e-12)
 
 
 def test_em_never_goes_down() -> None:
     x, sigma = np.abs(sample()[0]), sample()[1]
-    weight, mean, variance = np.array([0.5, 0.5]), np.array([20.0, 300.0]), np.array([900.0, 900.0])
-    values = []
-    for _ in range(30):
-        values.append(mixture_score(x, sigma**2, weight, mean, variance)[0])
-        mixture_em(x, sigma**2, weight, mean, variance, 1)
+    events = Events(x, sigma, None, plain=True)
+    start = Mixture(np.array([0.5, 0.5]), np.array([20.0, 300.0]), np.array([900.0, 900.0]))
+    values = [height(events, ascend(events, start, steps)) for steps in range(30)]
     assert np.all(np.diff(values) > -1e-9)
-    assert weight.sum() == pytest.approx(1, rel=1e-9)
 
 
 def test_the_table_of_species() -> None:

@@ -15,7 +15,7 @@ import iscat_analysis as ia
 from iscat_analysis.species import Efficiency, Given, Ladder, Number, describe
 from iscat_analysis.species.choices import Chosen
 from iscat_analysis.species.events import Events
-from iscat_analysis.species.structure import information, log_likelihood, parameters
+from iscat_analysis.species.structure import joint_problem, log_likelihood, parameters
 from iscat_analysis.species.tables import UNKNOWN_SIGMA_KDA, event_table, sentences
 
 EFFICIENCY = Efficiency(5.0, 13.0)
@@ -48,7 +48,7 @@ def test_shared_parameters_have_the_slope_that_differences_give(
     numerical = approx_fprime(theta, lambda t: log_likelihood(sample, t)[0], 1e-5)
     assert np.isfinite(value)
     assert np.allclose(slope, numerical, rtol=1e-3, atol=1e-2)
-    curved = information(sample, theta)
+    curved = joint_problem(sample).curvature(theta)
     for i in range(theta.size):
         shift = np.zeros(theta.size)
         shift[i] = 1e-4 * limits.scale[i]
@@ -65,8 +65,8 @@ def test_a_maximum_is_flat_inside_its_range(oligomers: pd.DataFrame) -> None:
     sample = [(events, found.structure)]
     theta = parameters(sample, [found.best])
     _, slope = log_likelihood(sample, theta)
-    step = np.linalg.solve(information(sample, theta), slope)
-    error = np.sqrt(np.diag(np.linalg.inv(information(sample, theta))))
+    step = np.linalg.solve(joint_problem(sample).curvature(theta), slope)
+    error = np.sqrt(np.diag(np.linalg.inv(joint_problem(sample).curvature(theta))))
     assert np.all(np.abs(step) < 0.05 * error)
 
 
