@@ -20,16 +20,18 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 import pandas as pd
 import scipy
 from scipy.special import log_ndtr
 
-from iscat_analysis.calibration.line import Line, mass_line, weighed
+from iscat_analysis.calibration.line import mass_line, weighed
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie.event_tables import named, read_events, unit_note
+from iscat_analysis.options import EventOptions, takes
 from iscat_analysis.reading import read_json
 from iscat_analysis.records import FloatArray, species_rows
 from iscat_analysis.species.events import POSSIBLE_KDA, Efficiency, Events, possible
@@ -139,29 +141,19 @@ def refuse_far(tables: Sequence[EventTable], masses_kda: Sequence[float], argume
     )
 
 
+@takes(EventOptions)
 def event_table(
-    events: str | Path | pd.DataFrame,
-    *,
-    name: str | None = None,
-    sigma_kda: float | None = None,
-    limit_kda: float | None = None,
-    limit_sigma_kda: float | None = None,
-    above_kda: float | None = None,
-    calibration: Line | None = None,
+    events: str | Path | pd.DataFrame, *, name: str | None = None, **options: Unpack[EventOptions]
 ) -> EventTable:
     """Take events from a file or a table in memory.
 
     With `calibration` their masses are those of its line, from their contrasts, whatever masses
     the table has.
     """
-    for option, value in (
-        ("sigma_kda", sigma_kda),
-        ("limit_kda", limit_kda),
-        ("limit_sigma_kda", limit_sigma_kda),
-        ("above_kda", above_kda),
-    ):
-        if value is not None:
-            mass_in(f"`{option}`", value)
+    sigma_kda, limit_kda, limit_sigma_kda, above_kda = (
+        None if options[key] is None else mass_in(f"`{key}`", options[key])
+        for key in ("sigma_kda", "limit_kda", "limit_sigma_kda", "above_kda")
+    )
     if limit_kda is not None and above_kda is not None:
         raise ConfigError(
             "`limit_kda` and `above_kda` are two ways to say what is missed; give one of them"
@@ -180,8 +172,8 @@ def event_table(
         )
     file = table.attrs.get("file")
     said = [*table.attrs["notes"]]
-    if calibration is not None:
-        table, replaced = weighed(table, mass_line(calibration), called)
+    if options["calibration"] is not None:
+        table, replaced = weighed(table, mass_line(options["calibration"]), called)
         said += [replaced] if replaced else []
     elif table["mass_kda"].isna().all() and table["contrast"].notna().any():
         raise DataError(
