@@ -20,6 +20,7 @@ from typing import (
     TYPE_CHECKING,
     Annotated,
     Any,
+    ForwardRef,
     Literal,
     TypeVar,
     get_args,
@@ -30,7 +31,8 @@ from typing import (
 import typer
 from typer.models import ArgumentInfo, OptionInfo
 
-from iscat_cli.console import Messages, failures
+from iscat_analysis.options import Option, options_of
+from iscat_cli.console import Messages, failures, with_options
 
 if TYPE_CHECKING:
     from iscat_analysis.config import Config
@@ -217,6 +219,10 @@ def command(work: Callable[..., None]) -> Command:
     """Make a command of a function, which may ask for `messages`, with the options of all."""
     about, helps, example = _read(work.__doc__)
     parameters = dict(inspect.signature(work, eval_str=True).parameters)
+    keywords: dict[str, tuple[Any, Option]] = {}
+    for each in [*parameters.values()]:
+        if each.kind is inspect.Parameter.VAR_KEYWORD:  # a group of the library's
+            keywords = options_of(get_args(parameters.pop(each.name).annotation)[0])
     heard = parameters.pop("messages", None) is not None
     own = parameters.values()
     groups: dict[str, Any] = {
@@ -242,19 +248,40 @@ def command(work: Callable[..., None]) -> Command:
         for name, group in groups.items():
             given[name] = group(**{field.name: given.pop(field.name) for field in fields(group)})
         with failures(told):
+            for name, (_, option) in keywords.items():
+                if option.text:
+                    given[name] = _READERS[option.text](option.flag, given[name]) or option.default
+            if "limit_kda" in given:
+                given["limit_kda"], given["limit_sigma_kda"] = given["limit_kda"] or (None, None)
             work(**given, **({"messages": told} if heard else {}))
 
     by_name = inspect.Parameter.KEYWORD_ONLY
     offered = [inspect.Parameter("context", by_name, annotation=typer.Context)]
     for each in parameters.values():
         offered += _members(each.annotation) if each.name in groups else [each]
-    described = [_described(each, helps, arguments) for each in (*offered, *_members(_Always))]
+    offered += [*_keywords(keywords), *_members(_Always)]
+    described = [_described(each, helps, arguments) for each in offered]
     named = [each.replace(kind=by_name) for each in described]
     vars(run)["__signature__"] = inspect.Signature(named)
     run.__annotations__ = {each.name: each.annotation for each in described}
     run.__doc__ = about
     example = example or vars(sys.modules[work.__module__]).get("EXAMPLE", "")
     return Command(work.__name__, about.partition("\n")[0], example, run)
+
+
+def _keywords(known: dict[str, tuple[Any, Option]]) -> Iterator[inspect.Parameter]:
+    """Give keywords of the library as options of a command."""
+    for name, (kind, option) in known.items():
+        if not option.flag:
+            continue
+        about = typer.Option(option.flag, metavar=option.metavar, help=with_options(option.help))
+        written = Path | None if isinstance(kind, ForwardRef) else kind
+        yield inspect.Parameter(
+            name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=None if option.text else option.default,
+            annotation=Annotated[str | None if option.text else written, about],
+        )
 
 
 def _members(group: type) -> Iterator[inspect.Parameter]:
@@ -375,16 +402,13 @@ def pair(option: str, text: str | None) -> tuple[float | None, float | None]:
     return parsed(option, text, read, f"write it as {option} 40 or {option} 40:8") or (None, None)
 
 
-CalibrationOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--calibration",
-        metavar="LINE.toml",
-        help="Mass line, as `iscat calibrate mass` writes it, in place of any other: masses are "
-        "those of the contrasts.",
-    ),
-]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace earlier output.")]
-JsonOption = Annotated[
-    bool, typer.Option("--json", help="Print one JSON object instead of a table.")
-]
+def monomer(option: str, text: str | None) -> float | Literal["auto"] | None:
+    """Read the mass of a monomer, or ``auto``."""
+    form = f"give the mass of the monomer in kDa, as in {option} 66, or auto"
+    return "auto" if text == "auto" else parsed(option, text, float, form)
+
+
+_READERS: dict[str, Callable[[str, str | None], Any]] = {
+    "numbers": numbers, "whole": whole, "monomer": monomer, "pair": pair,
+}  # fmt: skip
+"""How values are read whose type no command line knows."""

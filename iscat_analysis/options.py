@@ -22,12 +22,16 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 @dataclass(frozen=True)
 class Option:
-    """A keyword's default, its meaning, and the command's flag and placeholder of a value."""
+    """A keyword's default, its meaning, and the command's flag and placeholder of a value.
+
+    `text` says how a value is written on a command line that no type describes.
+    """
 
     default: Any
     help: str
     flag: str = ""
     metavar: str | None = None
+    text: Literal["", "numbers", "whole", "monomer", "pair"] = ""
 
 
 class EventOptions(TypedDict, total=False):
@@ -45,17 +49,15 @@ class EventOptions(TypedDict, total=False):
             "estimate [kDa]; default from the table.",
             "--limit",
             "M[:S]",
+            "pair",
         ),
     ]
     limit_sigma_kda: Annotated[
-        float | None,
-        Option(None, "Spread of the detector's estimate about `limit_kda` [kDa]."),
+        float | None, Option(None, "Spread of the detector's estimate about `limit_kda` [kDa].")
     ]
     above_kda: Annotated[
         float | None,
-        Option(
-            None, "Use events above this mass only, and correct for the cut.", "--above", "KDA"
-        ),
+        Option(None, "Use events above this mass only, and correct for the cut.", "--above", "KDA"),
     ]
     calibration: Annotated[
         "Line | None",
@@ -78,7 +80,9 @@ class CommonSpecies(EventOptions, total=False):
     ]
     masses_kda: Annotated[
         Sequence[float] | None,
-        Option(None, "Masses of the species, which are fixed [kDa].", "--masses", "M1,M2"),
+        Option(
+            None, "Masses of the species, which are fixed [kDa].", "--masses", "M1,M2", "numbers"
+        ),
     ]
     ladder: Annotated[
         float | Literal["auto"] | None,
@@ -88,11 +92,14 @@ class CommonSpecies(EventOptions, total=False):
             "finds it.",
             "--ladder",
             "M1",
+            "monomer",
         ),
     ]
     steps: Annotated[
         Sequence[int],
-        Option((), "Which oligomers, as in 1,2,4; default those found.", "--steps", "N1,N2"),
+        Option(
+            (), "Which oligomers, as in 1,2,4; default those found.", "--steps", "N1,N2", "whole"
+        ),
     ]
     background: Annotated[
         bool,
@@ -115,12 +122,11 @@ class SpeciesOptions(CommonSpecies, total=False):
             "Masses from which the fit of as many species begins [kDa]; they are free.",
             "--start",
             "M1,M2",
+            "numbers",
         ),
     ]
     offset: Annotated[bool, Option(False, "Fit an offset common to all oligomers.", "--offset")]
-    hold: Annotated[
-        bool, Option(False, "Fix the mass of the monomer at the one given.", "--hold")
-    ]
+    hold: Annotated[bool, Option(False, "Fix the mass of the monomer at the one given.", "--hold")]
     widths: Annotated[
         Literal["free", "common"],
         Option(
@@ -150,6 +156,7 @@ class BindingOptions(EventOptions, total=False):
             "Without it the monomer is found from peaks at one mass and its double.",
             "--masses",
             "M | A,B",
+            "numbers",
         ),
     ]
     landing_power: Annotated[
@@ -182,6 +189,11 @@ def only(keywords: type, given: Any) -> dict[str, Any]:
     return {name: given[name] for name in options_of(keywords) if name in given}
 
 
+def defaults(keywords: type) -> Any:
+    """Give the defaults of a group."""
+    return {name: option.default for name, (_, option) in options_of(keywords).items()}
+
+
 def takes(keywords: type) -> Callable[[F], F]:
     """Give a function with ``**options`` the keywords of a group, with their defaults."""
     known = options_of(keywords)
@@ -201,10 +213,11 @@ def takes(keywords: type) -> Callable[[F], F]:
         @wraps(work)
         def run(*given: Any, **options: Any) -> Any:
             signature.bind(*given, **options)
-            return work(*given, **{name: known[name][1].default for name in known} | options)
+            return work(*given, **defaults(keywords) | options)
 
         vars(run)["__signature__"] = signature
-        run.__doc__ = inspect.cleandoc(work.__doc__ or "").replace("**options", _described(known))
+        about = inspect.cleandoc(work.__doc__ or "").replace("**options", _described(known))
+        run.__doc__ = about + "\n"
         return run  # type: ignore[return-value]
 
     return expanded
@@ -221,5 +234,7 @@ def _described(known: dict[str, tuple[Any, Option]]) -> str:
 
 
 def _written(kind: Any) -> str:
-    text = kind.__forward_arg__ if hasattr(kind, "__forward_arg__") else inspect.formatannotation(kind)
+    text = (
+        kind.__forward_arg__ if hasattr(kind, "__forward_arg__") else inspect.formatannotation(kind)
+    )
     return text.replace("collections.abc.", "").replace("typing.", "").replace(" | None", "")

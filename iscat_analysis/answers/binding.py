@@ -6,28 +6,37 @@ Which peak of a series of tables is the monomer, where the user does not say.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Unpack, get_args
 
 import numpy as np
 import pandas as pd
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks, peak_prominences
 
-from iscat_analysis.calibration.line import Line
+from iscat_analysis.answers.output import Notify, folder_for, tell, write_answer
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.findings import Finding, existing
+from iscat_analysis.findings.tables import (
+    INACTIVE_PART,
+    MONOMER_TAKEN,
+    MOVIES_LEFT_OUT,
+    NO_EQUILIBRIUM,
+    NO_LOWER_END,
+    NO_UPPER_END,
+    OTHER_SPECIES,
+    SINGLE_TABLE,
+)
 from iscat_analysis.inference.checks import LARGEST, choice_in, number_in, path_in, truth_in
 from iscat_analysis.movie import path_beside, split_address
 from iscat_analysis.movie.text_tables import read_frame, refuse_twice
+from iscat_analysis.options import BindingOptions, EventOptions, only, takes
 from iscat_analysis.reading import is_file, is_folder, read_json
 from iscat_analysis.records import BoolArray, FloatArray
-from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.species import binding_figure
-from iscat_analysis.report.style import publish
-from iscat_analysis.report.tables import CSV_DIGITS
-from iscat_analysis.schemas import jsonable, to_json
+from iscat_analysis.schemas import jsonable
 from iscat_analysis.species import LEAST_EVENTS
 from iscat_analysis.species.describe import LEAST_EFFICIENCY
 from iscat_analysis.species.equilibrium import (
@@ -115,22 +124,16 @@ class Binding:
         }
 
 
+@takes(BindingOptions)
 def fit_kd(
     samples: str | Path | pd.DataFrame,
     *,
     model: Model,
-    masses_kda: Sequence[float] | None = None,
-    landing_power: float | None = None,
-    inactive: bool = False,
-    sigma_kda: float | None = None,
-    limit_kda: float | None = None,
-    limit_sigma_kda: float | None = None,
-    above_kda: float | None = None,
-    calibration: Line | None = None,
     tables: Sequence[EventTable | pd.DataFrame] | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
-    notify: Callable[[str], None] | None = None,
+    notify: Notify | None = None,
+    **options: Unpack[BindingOptions],
 ) -> Binding:
     """Fit an equilibrium constant to the events of a series of concentrations.
 
@@ -145,21 +148,6 @@ def fit_kd(
         concentration and events.
     model : {"dimer", "ab"}
         2 M ⇌ D, K_D = [M]²/[D]; or A + B ⇌ AB, K_D = [A][B]/[AB].
-    masses_kda : sequence of float, optional
-        About the mass of the monomer, or of A and B [kDa]; fitted.  A monomer that is not given is
-        taken from two peaks that the tables have at one mass and at twice that mass; a note says
-        which, and there is an error where there are none.
-    landing_power : float, optional
-        Landings are as concentration·mass^p: −1/6 for diffusion out of a drop at rest onto an
-        absorbing surface, −1/3 through a layer of liquid that flows, 0 for a surface that takes all
-        alike.  Without it p is −1/6 ± 1/6, and fitted.
-    inactive : bool
-        Fit the part of monomers, or of A, that does not bind.
-    sigma_kda, limit_kda, limit_sigma_kda, above_kda : float, optional
-        What is known of errors and of what was missed, as for `find_species` [kDa].
-    calibration : str, Path, Calibration or MassCalibration, optional
-        A mass line, as ``iscat calibrate mass`` writes it: masses are those of the contrasts, in
-        place of masses that a table has.
     tables : sequence of EventTable or pandas.DataFrame, optional
         The tables of all rows themselves, in place of ``path``.
     out : str or Path, optional
@@ -168,6 +156,7 @@ def fit_kd(
         Replace an earlier result in `out`.
     notify : callable, optional
         Given each note, a sentence.
+    **options
 
     Returns
     -------
@@ -196,68 +185,18 @@ def fit_kd(
     >>> found.fit.kd_low < 10 < found.fit.kd_high
     True
     """
-    check_reaction(model, masses_kda)
-    if landing_power is not None and not -1 <= number_in("`landing_power`", landing_power) <= 1:
-        raise ConfigError(
-            f"`landing_power` = {landing_power:g}: must lie between -1 and 1, as in -0.167"
-        )
-    truth_in("`inactive`", inactive)
-    folder = None if out is None else path_in("`out`", out)
-    if folder is not None:
-        check_output(folder, overwrite, known=BINDING_FILES)
+    check_reaction(model, options["masses_kda"])
+    power = options["landing_power"]
+    if power is not None and not -1 <= number_in("`landing_power`", power) <= 1:
+        raise ConfigError(f"`landing_power` = {power:g}: must lie between -1 and 1, as in -0.167")
+    truth_in("`inactive`", options["inactive"])
+    folder = folder_for(out, BINDING_FILES, overwrite=overwrite)
     name = "samples" if isinstance(samples, pd.DataFrame) else str(samples)
-    rows = (
-        samples
-        if isinstance(samples, pd.DataFrame)
-        else from_table(read_frame(path_in("`samples`", samples)))
-    )
-    rows, kept = _used(rows, name)
-    notes: list[str] = []
-    of_batch = tables is None and "report" in rows
-    if of_batch:
-        rows, notes = _analysed(rows, CONCENTRATIONS[model], name)
-    totals = _totals(rows, model, name)
-    rows[list(CONCENTRATIONS[model])] = totals
-    base = None if isinstance(samples, pd.DataFrame) else Path(samples).parent
-    sources: Sequence[EventTable | pd.DataFrame | Path]
-    if tables is None:
-        sources = _paths(rows, base, name)
-    elif isinstance(tables, (list, tuple)) and len(tables) == kept.size:
-        sources = [table for table, keep in zip(tables, kept, strict=True) if keep]
-    else:
-        raise ConfigError(f"`tables`: give a list with one for each of {kept.size} rows")
-    found = [
-        table if isinstance(table, EventTable)
-        else event_table(
-            table, name=None if isinstance(table, Path) else f"table {number + 1}",
-            sigma_kda=sigma_kda, limit_kda=limit_kda, limit_sigma_kda=limit_sigma_kda,
-            above_kda=above_kda, calibration=calibration,
-        )
-        for number, table in enumerate(sources)
-    ]  # fmt: skip
-    enough, few = with_events(found)
-    if of_batch and any(enough):
-        notes += few
-        found = [table for table, keep in zip(found, enough, strict=True) if keep]
-        rows, totals = rows[enough].reset_index(drop=True), totals[enough]
-    for table in found:
-        if table.mass_kda.size < LEAST_EVENTS:
-            raise DataError(
-                f"{table.name}: holds {count(table.mass_kda.size, 'event')}, too few; "
-                f"{LEAST_EVENTS} are needed, or leave it out of {name}"
-            )
-    masses: tuple[float, ...]
-    if masses_kda is None:
-        monomer, taken = monomer_of(found)
-        masses = (monomer,)
-        notes.append(taken)
-    else:
-        masses = tuple(map(float, masses_kda))
-        complex_kda = 2 * masses[0] if model == "dimer" else sum(masses)
-        refuse_far(found, [*masses, complex_kda], "`masses_kda`")
+    rows, totals, found, findings = _series(samples, name, model, tables, options)
+    masses, about = _masses(found, model, options["masses_kda"])
     fit = fit_equilibrium(
-        [_to_fit(table) for table in found], totals, model=model, masses_kda=masses,
-        power=landing_power, inactive=inactive,
+        [_to_fit(table) for table in found], totals, model=model, masses_kda=masses, power=power,
+        inactive=options["inactive"],
     )  # fmt: skip
     lightest = int(np.argmin(fit.masses_kda))
     if fit.detected[lightest] < LEAST_EFFICIENCY:
@@ -267,25 +206,80 @@ def fit_kd(
             "kDa), so that K_D is not determined; a lower threshold of detection would tell, or "
             "`limit_kda` if it is known"
         )
-    result = Binding(
-        model,
-        fit,
-        _laid_out(rows, found, fit),
-        _curve(totals, fit, model),
-        (*notes, *_notes(found, fit, totals, masses, inactive=inactive)),
-    )
-    if notify is not None:
-        for note in result.notes:
-            notify(note)
-    if folder is not None:
-        contents = {"source": name, **result.to_dict()}
-        with atomic_folder(folder, overwrite, known=BINDING_FILES) as building:
-            samples = in_table(result.samples)
-            samples.to_csv(building / "kd.csv", index=False, float_format=f"%.{CSV_DIGITS}g")
-            (building / "kd.json").write_text(to_json("kd", contents) + "\n", "utf-8")
-            (building / "figures").mkdir()
-            publish(binding_figure(jsonable(contents)), building / "figures")
+    notes = [
+        *(finding.text for finding in existing([*findings, about])),
+        *sentences(finding for table in found for finding in table.findings),
+        *(finding.text for finding in _doubts(found, fit, masses, inactive=options["inactive"])),
+    ]
+    samples_table = _laid_out(rows, found, fit)
+    result = Binding(model, fit, samples_table, _curve(totals, fit, model), tuple(notes))
+    tell(notes, notify)
+    contents = {"source": name, **result.to_dict()}
+    files = {"kd.csv": in_table(result.samples), "kd.json": ("kd", contents)}
+    write_answer(
+        folder, BINDING_FILES, files, lambda: binding_figure(jsonable(contents)),
+        overwrite=overwrite,
+    )  # fmt: skip
     return result
+
+
+def _series(
+    samples: str | Path | pd.DataFrame,
+    name: str,
+    model: Model,
+    tables: Sequence[EventTable | pd.DataFrame] | None,
+    options: BindingOptions,
+) -> tuple[pd.DataFrame, FloatArray, list[EventTable], list[Finding]]:
+    """Read rows, concentrations and events of a series, and say what is left out."""
+    base = None if isinstance(samples, pd.DataFrame) else path_in("`samples`", samples)
+    rows = samples if base is None else from_table(read_frame(base))
+    assert isinstance(rows, pd.DataFrame)
+    rows, kept = _used(rows, name)
+    findings: list[Finding] = []
+    of_batch = tables is None and "report" in rows
+    if of_batch:
+        rows, findings = _analysed(rows, CONCENTRATIONS[model], name)
+    totals = _totals(rows, model, name)
+    rows[list(CONCENTRATIONS[model])] = totals
+    sources: Sequence[EventTable | pd.DataFrame | Path]
+    if tables is None:
+        sources = _paths(rows, None if base is None else base.parent, name)
+    elif isinstance(tables, (list, tuple)) and len(tables) == kept.size:
+        sources = [table for table, keep in zip(tables, kept, strict=True) if keep]
+    else:
+        raise ConfigError(f"`tables`: give a list with one for each of {kept.size} rows")
+    found = [
+        event_table(
+            table, name=None if isinstance(table, Path) else f"table {number + 1}",
+            **only(EventOptions, options),
+        )
+        for number, table in enumerate(sources)
+    ]  # fmt: skip
+    enough, few = with_events(found)
+    if of_batch and any(enough):
+        findings += existing([few])
+        found = [table for table, keep in zip(found, enough, strict=True) if keep]
+        rows, totals = rows[enough].reset_index(drop=True), totals[enough]
+    for table in found:
+        if table.mass_kda.size < LEAST_EVENTS:
+            raise DataError(
+                f"{table.name}: holds {count(table.mass_kda.size, 'event')}, too few; "
+                f"{LEAST_EVENTS} are needed, or leave it out of {name}"
+            )
+    return rows, totals, found, findings
+
+
+def _masses(
+    tables: Sequence[EventTable], model: Model, given: Sequence[float] | None
+) -> tuple[tuple[float, ...], Finding | None]:
+    """Give the masses of the partners, or find the monomer and say which peak was taken for it."""
+    if given is None:
+        monomer, taken = monomer_of(tables)
+        return (monomer,), taken
+    masses = tuple(map(float, given))
+    complex_kda = 2 * masses[0] if model == "dimer" else sum(masses)
+    refuse_far(tables, [*masses, complex_kda], "`masses_kda`")
+    return masses, None
 
 
 def check_reaction(
@@ -325,27 +319,26 @@ def _used(rows: pd.DataFrame, name: str) -> tuple[pd.DataFrame, BoolArray]:
     return rows[kept].reset_index(drop=True), kept
 
 
-def with_events(tables: Sequence[EventTable]) -> tuple[list[bool], tuple[str, ...]]:
+def with_events(tables: Sequence[EventTable]) -> tuple[list[bool], Finding | None]:
     """Tell which tables have enough events for an equilibrium."""
     enough = [table.mass_kda.size >= LEAST_EVENTS for table in tables]
     few = [table.name for table, keep in zip(tables, enough, strict=True) if not keep]
-    return enough, (
-        (f"left out, with less than {LEAST_EVENTS} events: {', '.join(few)}",) if few else ()
-    )
+    why = {"why": f"with less than {LEAST_EVENTS} events", "names": ", ".join(few)}
+    return enough, MOVIES_LEFT_OUT(why) if few else None
 
 
 def _analysed(
     rows: pd.DataFrame, columns: Sequence[str], name: str
-) -> tuple[pd.DataFrame, list[str]]:
+) -> tuple[pd.DataFrame, list[Finding]]:
     """Keep the movies of a batch that have a result and a concentration; say which have not."""
     has_result = rows["report"].astype(object).fillna("").ne("").to_numpy()
     given = rows.reindex(columns=list(columns)).notna().all(axis=1).to_numpy()
     if not set(columns) <= set(rows):
         given[:] = True  # that a column is missing is said of the whole table
     names = rows["movie"] if "movie" in rows else rows["path"] if "path" in rows else rows["report"]
-    notes = [
-        f"left out, {what}: {', '.join(names[gone].astype(str))}"
-        for what, gone in (
+    findings = [
+        MOVIES_LEFT_OUT({"why": why, "names": ", ".join(names[gone].astype(str))})
+        for why, gone in (
             ("not analysed", given & ~has_result),
             (f"without {' and '.join(columns)}", ~given),
         )
@@ -353,7 +346,7 @@ def _analysed(
     ]
     if not (given & has_result).any():
         raise DataError(f"{name}: has no sample that is analysed and has a concentration")
-    return rows[given & has_result].reset_index(drop=True), notes
+    return rows[given & has_result].reset_index(drop=True), findings
 
 
 def _totals(rows: pd.DataFrame, model: Model, name: str) -> FloatArray:
@@ -442,42 +435,29 @@ def _curve(totals: FloatArray, fit: EquilibriumFit, model: Model) -> pd.DataFram
     return pd.DataFrame({"concentration_nm": grid[:, 0], "complexes": 1 / (1 + np.exp(-logits))})
 
 
-def _notes(
+def _doubts(
     tables: Sequence[EventTable],
     fit: EquilibriumFit,
-    totals: FloatArray,
     masses_kda: Sequence[float],
     *,
     inactive: bool,
-) -> tuple[str, ...]:
-    notes = sentences(note for table in tables for note in table.notes)
-    for given, fitted in zip(masses_kda, fit.masses_kda, strict=False):
+) -> Iterator[Finding]:
+    """Doubt the constant."""
+    for given, fitted in zip(masses_kda, fit.masses_kda.tolist(), strict=False):
         if abs(fitted / given - 1) > _OTHER_MASS:
-            notes.append(
-                f"no species of {given:.3g} kDa was found, but one of {fitted:.3g}: K_D is wrong "
-                "where that is another species, as the dimer of a monomer that is missed; look at "
-                "`masses_kda`"
-            )
+            yield OTHER_SPECIES({"given_kda": given, "found_kda": fitted})
     if fit.p_value < _WRONG:
         far = [t.name for t, pull in zip(tables, fit.pull, strict=True) if abs(pull) > _FAR]
         named = f" (farthest: {', '.join(far[:3])})" if far else ""
-        notes.append(
-            f"the tables do not follow this equilibrium, p = {fit.p_value:.1g}{named}, and the "
-            "interval of K_D is too narrow: look at concentrations, replicates and what is missed "
-            "of the lightest"
-        )
+        yield NO_EQUILIBRIUM({"p_value": fit.p_value, "farthest": named})
     if not inactive and fit.inactive_p < _WRONG:
-        notes.append(
-            f"an inactive part describes the tables better (p = {fit.inactive_p:.1g} without), and "
-            "K_D is wrong where there is one: fit it with `inactive`"
-        )
+        yield INACTIVE_PART({"p_value": fit.inactive_p})
     if not math.isfinite(fit.kd_high):
-        notes.append("complexes are too few for an upper end of K_D: measure higher concentrations")
+        yield NO_UPPER_END()
     if fit.kd_low == 0:
-        notes.append("free partners are too few for a lower end of K_D: dilute further")
-    if totals.shape[0] < 2:
-        notes.append("a single table tests no model: whether its K_D is one is not known")
-    return tuple(notes)
+        yield NO_LOWER_END()
+    if len(tables) < 2:
+        yield SINGLE_TABLE()
 
 
 _POSSIBLE_PEAKS = (0.0, 11.5)  # ln of masses in kDa
@@ -488,7 +468,7 @@ _CLEAR_PEAK = 4.0  # the same in standard errors
 _NEAR_TWICE = 0.16  # of ln m: the lighter peak is shifted where much of it is missed
 
 
-def monomer_of(tables: Sequence[EventTable]) -> tuple[float, str]:
+def monomer_of(tables: Sequence[EventTable]) -> tuple[float, Finding]:
     """Find the monomer in the events of all tables, and say what was taken.
 
     Every table counts alike.  Two peaks of the density of ln m, one at about twice the other, are
@@ -521,8 +501,5 @@ def monomer_of(tables: Sequence[EventTable]) -> tuple[float, str]:
         )
     _, one, two = max(pairs)
     # The dimer's peak is whole where that of the monomer may be cut by what is missed.
-    monomer = float(masses[two]) / 2
-    return monomer, (
-        f"the monomer was taken for the peak at {masses[one]:.3g} kDa, its dimer for that at "
-        f"{masses[two]:.3g} kDa; `masses_kda` names another"
-    )
+    taken = {"monomer_kda": float(masses[one]), "dimer_kda": float(masses[two])}
+    return float(masses[two]) / 2, MONOMER_TAKEN(taken)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import tifffile
 
+from iscat_analysis.answers.output import Notify, folder_for, tell, write_answer
 from iscat_analysis.calibration import (
     LEAST_EVENTS,
     ContrastPeak,
@@ -24,6 +24,7 @@ from iscat_analysis.calibration import (
 from iscat_analysis.calibration.line import made_with, measured_contrasts
 from iscat_analysis.camera import CameraCalibration, measure_camera
 from iscat_analysis.config import Config
+from iscat_analysis.findings.tables import NO_RECORDED_OPTICS
 from iscat_analysis.instrument.learning import calibrate_movie
 from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.instrument.template import MeasuredPicture, measure_template
@@ -31,9 +32,8 @@ from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.optics.measured import sha256_of
 from iscat_analysis.records import FloatArray, Progress, silent
-from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.calibration import camera_page, mass_page, optics_page, template_page
-from iscat_analysis.schemas import jsonable, to_json
+from iscat_analysis.schemas import jsonable
 
 CAMERA_FILES = frozenset(
     {
@@ -59,12 +59,6 @@ TEMPLATE_FILES = frozenset({"template.json", "template.npz", "template.html", "o
 
 _BINS = 120
 
-_NO_RECORD = (
-    "does not say with what optics the standards were measured, so that [calibration] has no "
-    "record of them and is taken at those that are configured where it is used; give the folder "
-    "of an analysis, with its config.toml"
-)
-
 
 def camera_calibration(
     stacks: Sequence[Path],
@@ -75,34 +69,31 @@ def camera_calibration(
     maps: bool = False,
     overwrite: bool = False,
     progress: Progress = silent,
-    notify: Callable[[str], None] | None = None,
+    notify: Notify | None = None,
 ) -> CameraCalibration:
     """Calibrate a camera from recordings and write what was found."""
-    check_output(out, overwrite, known=CAMERA_FILES)
+    folder_for(out, CAMERA_FILES, overwrite=overwrite)
     with ExitStack() as opened:
         light = [opened.enter_context(open_stack(path)) for path in stacks]
         shade = opened.enter_context(open_stack(dark)) if dark is not None else None
         found = measure_camera(
             light, dark=shade, offset_adu=offset_adu, maps=maps, progress=progress
         )
-    for note in found.notes:
-        if notify is not None:
-            notify(note)
+    tell(found.notes, notify)
     names = {key: f"{key}.tif" for key in found.maps}
     title = ", ".join(path.name for path in (*stacks, *([dark] if dark else [])))
     contents = {"recordings": [str(p) for p in stacks], "dark": str(dark) if dark else None}
     contents |= found.to_dict()
     toml = found.to_toml(names)
-    with atomic_folder(out, overwrite, known=CAMERA_FILES) as folder:
-        (folder / "camera.json").write_text(to_json("camera", contents) + "\n", encoding="utf-8")
-        (folder / "camera.toml").write_text(toml, encoding="utf-8")
-        for key, values in found.maps.items():
-            tifffile.imwrite(folder / names[key], values.astype(np.float32))
-        if maps:
-            masked = np.logical_or.reduce(list(found.masked.values()))
-            tifffile.imwrite(folder / "masked.tif", masked.astype(np.uint8))
-        page = camera_page(title, jsonable(contents), toml)
-        (folder / "camera.html").write_text(page, encoding="utf-8")
+    masked = np.logical_or.reduce(list(found.masked.values())).astype(np.uint8) if maps else None
+    files = {
+        "camera.json": ("camera", contents),
+        "camera.toml": toml,
+        **{names[key]: values.astype(np.float32) for key, values in found.maps.items()},
+        "masked.tif": masked,
+        "camera.html": camera_page(title, jsonable(contents), toml),
+    }
+    write_answer(out, CAMERA_FILES, files, overwrite=overwrite)
     return found
 
 
@@ -116,29 +107,27 @@ def optics_calibration(
     focus_step_nm: float | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
-    notify: Callable[[str], None] | None = None,
+    notify: Notify | None = None,
 ) -> OpticsCalibration:
     """Learn the optics from a movie and write what was found.
 
     Shapes: `movie` (t, y, x).
     """
-    check_output(out, overwrite, known=OPTICS_FILES)
+    folder_for(out, OPTICS_FILES, overwrite=overwrite)
     with open_stack(movie, name=name) as stack:
         title = stack.path.name
         found = calibrate_movie(
             stack, config, free=free, focus_step_nm=focus_step_nm, progress=progress, notify=notify
         )
-    for note in found.notes:
-        if notify is not None:
-            notify(note)
+    tell(found.notes, notify)
     contents = found.to_dict()
     toml = found.to_toml()
-    with atomic_folder(out, overwrite, known=OPTICS_FILES) as folder:
-        (folder / "optics.json").write_text(to_json("optics", contents) + "\n", encoding="utf-8")
-        if found.accepted:
-            (folder / "optics.toml").write_text(toml, encoding="utf-8")
-        page = optics_page(title, jsonable(contents), toml)
-        (folder / "optics.html").write_text(page, encoding="utf-8")
+    files = {
+        "optics.json": ("optics", contents),
+        "optics.toml": toml if found.accepted else None,
+        "optics.html": optics_page(title, jsonable(contents), toml),
+    }
+    write_answer(out, OPTICS_FILES, files, overwrite=overwrite)
     return found
 
 
@@ -149,23 +138,22 @@ def template_calibration(
     *,
     overwrite: bool = False,
     progress: Progress = silent,
-    notify: Callable[[str], None] | None = None,
+    notify: Notify | None = None,
 ) -> MeasuredPicture:
     """Measure the picture of a particle in a movie and write what was found."""
-    check_output(out, overwrite, known=TEMPLATE_FILES)
+    folder_for(out, TEMPLATE_FILES, overwrite=overwrite)
     with open_stack(movie) as stack:
         found = measure_template(stack, config, progress=progress, notify=notify)
     content = found.template.to_bytes()
     toml = found.to_toml("template.npz", sha256_of(content))
     contents = found.to_dict()
-    with atomic_folder(out, overwrite, known=TEMPLATE_FILES) as folder:
-        text = to_json("template", contents)
-        (folder / "template.json").write_text(text + "\n", encoding="utf-8")
-        if found.accepted:
-            (folder / "template.npz").write_bytes(content)
-            (folder / "optics.toml").write_text(toml, encoding="utf-8")
-        page = template_page(movie.name, jsonable(contents), found.template, toml)
-        (folder / "template.html").write_text(page, encoding="utf-8")
+    files = {
+        "template.json": ("template", contents),
+        "template.npz": content if found.accepted else None,
+        "optics.toml": toml if found.accepted else None,
+        "template.html": template_page(movie.name, jsonable(contents), found.template, toml),
+    }
+    write_answer(out, TEMPLATE_FILES, files, overwrite=overwrite)
     return found
 
 
@@ -179,14 +167,14 @@ def mass_calibration(
     landing: Landing | None = None,
     standards: Config | None = None,
     overwrite: bool = False,
-    notify: Callable[[str], None] | None = None,
+    notify: Notify | None = None,
 ) -> MassCalibration:
     """Calibrate contrast against standards and write what was found.
 
     The configuration of their analysis, which says with what optics they were measured, is that
     beside ``fits.csv`` where none is given.
     """
-    check_output(out, overwrite, known=MASS_FILES)
+    folder_for(out, MASS_FILES, overwrite=overwrite)
     table = read_contrasts(events)
     contrast = table["contrast"].to_numpy(float)
     if landing is None:
@@ -203,13 +191,11 @@ def mass_calibration(
     )
     standards = made_with(table) if standards is None else standards
     if standards is None:
-        notes = (*found.notes, f"{events}: {_NO_RECORD}")
-        found = replace(found, notes=notes)
+        findings = (*found.findings, NO_RECORDED_OPTICS(where=str(events)))
+        found = replace(found, findings=findings)
     else:
         found = replace(found, recorded=standards_of(standards))
-    for note in found.notes:
-        if notify is not None:
-            notify(note)
+    tell(found.notes, notify)
     direction = -1.0 if found.landing == "dark" else 1.0
     size = direction * contrast[direction * contrast > 0]
     top = 1.25 * max(peak.contrast for peak in found.peaks)
@@ -220,12 +206,12 @@ def mass_calibration(
         "histogram": {"edges": edges.tolist(), "counts": counts.tolist()},
     }
     toml = found.to_toml()
-    with atomic_folder(out, overwrite, known=MASS_FILES) as folder:
-        text = to_json("calibration", contents)
-        (folder / "calibration.json").write_text(text + "\n", encoding="utf-8")
-        (folder / "calibration.toml").write_text(toml, encoding="utf-8")
-        page = mass_page(events.name, jsonable(contents), toml)
-        (folder / "calibration.html").write_text(page, encoding="utf-8")
+    files = {
+        "calibration.json": ("calibration", contents),
+        "calibration.toml": toml,
+        "calibration.html": mass_page(events.name, jsonable(contents), toml),
+    }
+    write_answer(out, MASS_FILES, files, overwrite=overwrite)
     return found
 
 

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias, Unpack
 
 import numpy as np
 import pandas as pd
 
+from iscat_analysis.answers.output import Notify, folder_for, tell, write_answer
 from iscat_analysis.answers.species import choice_of
-from iscat_analysis.calibration.line import Line
 from iscat_analysis.errors import DataError
-from iscat_analysis.inference.checks import number_in, path_in
+from iscat_analysis.findings.tables import MANY_COMPARISONS, SCALE_NOT_IN_SHIFTS
+from iscat_analysis.inference.checks import number_in
+from iscat_analysis.options import (
+    CommonSpecies,
+    EventOptions,
+    SpeciesOptions,
+    defaults,
+    only,
+    takes,
+)
 from iscat_analysis.records import FloatArray, Progress, silent
-from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.species import comparison_figure
-from iscat_analysis.report.style import publish
-from iscat_analysis.report.tables import CSV_DIGITS
-from iscat_analysis.schemas import jsonable, to_json
+from iscat_analysis.schemas import jsonable
 from iscat_analysis.species import LEAST_EVENTS, Comparison
 from iscat_analysis.species.comparison import compare
 from iscat_analysis.species.events import Events
@@ -38,44 +44,19 @@ _MOST_POOLED = 20_000  # events that choose the species
 _DRAWN = 8  # samples in the figure's left panel
 _BINS = 120
 _REACH = 0.98  # quantile of the masses that is drawn
+_CHANCE = 0.05  # p-value that is called significant
 _MANY = 5  # comparisons that should be told of chance
 
 
-def compare_samples(
-    first: Table,
-    other: Table,
-    *,
-    k: int | None = None,
-    masses_kda: Sequence[float] | None = None,
-    ladder: float | Literal["auto"] | None = None,
-    steps: Sequence[int] = (),
-    background: bool = True,
-    sigma_kda: float | None = None,
-    limit_kda: float | None = None,
-    limit_sigma_kda: float | None = None,
-    above_kda: float | None = None,
-    calibration: Line | None = None,
-) -> Comparison:
+@takes(CommonSpecies)
+def compare_samples(first: Table, other: Table, **options: Unpack[CommonSpecies]) -> Comparison:
     """Test whether two samples are one, and measure by how much they differ.
 
     Parameters
     ----------
     first, other : str, Path, pandas.DataFrame or EventTable
         Two tables of events, as for `find_species`.
-    k : int, optional
-        So many species; by default as many as BIC likes.
-    masses_kda : sequence of float, optional
-        Species of about these masses [kDa].
-    ladder : float or "auto", optional
-        Oligomers of a monomer of about this mass [kDa], or of one to be found.
-    steps : sequence of int
-        Which oligomers; by default they are found.
-    background : bool
-        Whether something else may be there, broad and faint.
-    sigma_kda, limit_kda, limit_sigma_kda, above_kda : float, optional
-        What is known of errors and of what was missed, as for `find_species` [kDa].
-    calibration : str, Path, Calibration or MassCalibration, optional
-        A mass line, as for `find_species`.
+    **options
 
     Returns
     -------
@@ -101,31 +82,19 @@ def compare_samples(
     >>> bool(found.same_masses.p_value < 1e-6), bool(8 < found.species["shift_kda"][0] < 12)
     (True, True)
     """
-    return compare_tables(
-        [first, other], k=k, masses_kda=masses_kda, ladder=ladder, steps=steps,
-        background=background, sigma_kda=sigma_kda, limit_kda=limit_kda,
-        limit_sigma_kda=limit_sigma_kda, above_kda=above_kda, calibration=calibration,
-    )[0]  # fmt: skip
+    return compare_tables([first, other], **options)[0]
 
 
+@takes(CommonSpecies)
 def compare_tables(
     tables: Sequence[Table],
     *,
-    k: int | None = None,
-    masses_kda: Sequence[float] | None = None,
-    ladder: float | Literal["auto"] | None = None,
-    steps: Sequence[int] = (),
-    background: bool = True,
-    sigma_kda: float | None = None,
-    limit_kda: float | None = None,
-    limit_sigma_kda: float | None = None,
-    above_kda: float | None = None,
-    calibration: Line | None = None,
     workers: int | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
-    notify: Callable[[str], None] | None = None,
+    notify: Notify | None = None,
+    **options: Unpack[CommonSpecies],
 ) -> list[Comparison]:
     """Compare many samples with the first of them.
 
@@ -133,21 +102,6 @@ def compare_tables(
     ----------
     tables : sequence of str, Path, pandas.DataFrame or EventTable
         Two or more, the first is what the others are compared with.
-    k : int, optional
-        So many species; by default as many as BIC likes.
-    masses_kda : sequence of float, optional
-        Species of about these masses [kDa].
-    ladder : float or "auto", optional
-        Oligomers of a monomer of about this mass [kDa], or of one to be found.
-    steps : sequence of int
-        Which oligomers; by default they are found.
-    background : bool
-        Whether something else may be there, broad and faint.
-    sigma_kda, limit_kda, limit_sigma_kda, above_kda : float, optional
-        As for `find_species` [kDa].
-    calibration : str, Path, Calibration or MassCalibration, optional
-        A mass line, as ``iscat calibrate mass`` writes it: masses are those of the contrasts, in
-        place of masses that a table has.
     workers : int, optional
         Threads; default as many as there are processors.
     out : str or Path, optional
@@ -158,6 +112,7 @@ def compare_tables(
         Called with the stage and the steps done and in all.
     notify : callable, optional
         Given each note, a sentence.
+    **options
 
     Returns
     -------
@@ -175,26 +130,16 @@ def compare_tables(
     -----
     The species are chosen once, on events of all tables, at most `_MOST_POOLED` evenly from each.
     """
-    choice = choice_of(
-        k, masses_kda, ladder, steps=steps, offset=False, hold=False, widths="free",
-        background=background,
-    )  # fmt: skip
-    folder = None if out is None else path_in("`out`", out)
-    if folder is not None:
-        check_output(folder, overwrite, known=COMPARISON_FILES)
+    choice = choice_of(defaults(SpeciesOptions) | options)
+    folder = folder_for(out, COMPARISON_FILES, overwrite=overwrite)
     if workers is not None:
         workers = int(number_in("`workers`", workers, least=1, most=_MOST_WORKERS, whole=True))
     if not isinstance(tables, (list, tuple)) or len(tables) < 2:
         raise DataError("a comparison needs two tables of events, or more")
     read: list[EventTable] = []
     for number, table in enumerate(tables):
-        one = table
-        if not isinstance(one, EventTable):
-            one = event_table(
-                one, name=f"table {number + 1}" if isinstance(one, pd.DataFrame) else None,
-                sigma_kda=sigma_kda, limit_kda=limit_kda, limit_sigma_kda=limit_sigma_kda,
-                above_kda=above_kda, calibration=calibration,
-            )  # fmt: skip
+        name = f"table {number + 1}" if isinstance(table, pd.DataFrame) else None
+        one = event_table(table, name=name, **only(EventOptions, options))
         if one.mass_kda.size < LEAST_EVENTS:
             raise DataError(
                 f"{one.name}: holds {count(one.mass_kda.size, 'event')}, too few to compare; "
@@ -215,20 +160,16 @@ def compare_tables(
     with threads(workers or processors()) as pool:
         found = list(pool.map(pair, read[1:]))
     notes = _notes(read, found)
-    if notify is not None:
-        for note in notes:
-            notify(note)
-    if folder is not None:
-        contents = comparison_document(read[0].name, [t.name for t in read[1:]], found, notes)
-        with atomic_folder(folder, overwrite, known=COMPARISON_FILES) as building:
-            in_table(comparison_rows(contents)).to_csv(
-                building / "comparison.csv", index=False, float_format=f"%.{CSV_DIGITS}g"
-            )
-            text = to_json("species_comparison", contents)
-            (building / "comparison.json").write_text(text + "\n", "utf-8")
-            (building / "figures").mkdir()
-            figure = comparison_figure(jsonable(contents), _histograms(read))
-            publish(figure, building / "figures")
+    tell(notes, notify)
+    contents = comparison_document(read[0].name, [t.name for t in read[1:]], found, notes)
+    files = {
+        "comparison.csv": in_table(comparison_rows(contents)),
+        "comparison.json": ("species_comparison", contents),
+    }
+    write_answer(
+        folder, COMPARISON_FILES, files,
+        lambda: comparison_figure(jsonable(contents), _histograms(read)), overwrite=overwrite,
+    )  # fmt: skip
     return found
 
 
@@ -288,15 +229,10 @@ def _histograms(tables: Sequence[EventTable]) -> list[dict[str, Any]]:
 
 def _notes(tables: Sequence[EventTable], found: Sequence[Comparison]) -> list[str]:
     """List what the tests assume."""
-    notes = sentences(note for table in tables for note in table.remarks)
+    notes = sentences(finding for table in tables for finding in table.remarks)
     if any(table.scale_error is not None for table in tables):
-        notes.append(
-            "errors of shifts do not include that of the mass scale: samples with different "
-            "calibrations may differ by it (systematic_mass_kda of the tables)"
-        )
-    if len(found) > _MANY:
-        notes.append(
-            f"{len(found)} comparisons: by chance alone some {0.05 * len(found):.2g} have p < "
-            f"0.05; below {0.05 / len(found):.2g} a difference is significant among them all"
-        )
+        notes.append(SCALE_NOT_IN_SHIFTS().text)
+    if (number := len(found)) > _MANY:
+        chance = {"by_chance": _CHANCE * number, "significant": _CHANCE / number}
+        notes.append(MANY_COMPARISONS({"number": number, **chance}).text)
     return notes

@@ -24,7 +24,7 @@ Rates of landing and leaving from a table of events that has frames.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -36,6 +36,8 @@ from scipy.special import chdtrc, kolmogorov
 
 from iscat_analysis.calibration.line import Line
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.tables import CHANCE_PAIRS, NO_DEPLETION_LAW, PARTLY_SEARCHED
 from iscat_analysis.inference.checks import number_in, shown
 from iscat_analysis.reading import read_text, toml_of
 from iscat_analysis.records import BoolArray, FloatArray
@@ -214,6 +216,7 @@ def _middle(x: float) -> float:
 RADIUS_PX = 1.5
 """Farthest that landing and leaving of one particle may lie apart [px]."""
 
+_WRONG = 0.01  # p-value of an exponential depletion
 _CHANCE = 0.1  # part of the pairs
 _SEARCHED = 0.95  # share of field and time below which it is said
 
@@ -232,15 +235,20 @@ class Kinetics:
         Which it is in [1/s].
     frames : tuple of int
         In which events were looked for, ``[start, stop)``.
-    notes : tuple of str
-        What the user should know, one sentence each.
+    findings : tuple of Finding
+        What the user should know.
     """
 
     landing: LandingRate
     unbinding: UnbindingRate | None
     frame_rate_hz: float
     frames: tuple[int, int]
-    notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences of the findings."""
+        return tuple(finding.text for finding in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
         """Give everything as plain values.
@@ -250,7 +258,14 @@ class Kinetics:
         dict
             Nested.
         """
-        return asdict(self)
+        unbinding = None if self.unbinding is None else vars(self.unbinding)
+        return {
+            "landing": vars(self.landing),
+            "unbinding": unbinding,
+            "frame_rate_hz": self.frame_rate_hz,
+            "frames": self.frames,
+            "notes": self.notes,
+        }
 
 
 def fit_kinetics(
@@ -307,9 +322,7 @@ def fit_kinetics(
     >>> found.landing.per_second_low < 400 / 60 < found.landing.per_second_high
     True
     """
-    table = events
-    if not isinstance(table, EventTable):
-        table = event_table(table, calibration=calibration)
+    table = event_table(events, calibration=calibration)
     if frame_rate_hz is None and isinstance(events, (str, Path)):
         frame_rate_hz = configured_frame_rate(Path(events))
     if frame_rate_hz is None:
@@ -330,7 +343,7 @@ def fit_kinetics(
     landing = landing_rate(
         (frame[lands] - start + 0.5) / frame_rate_hz, (stop - start) / frame_rate_hz
     )
-    notes = []
+    findings = []
     searched = table.efficiency.searched if table.efficiency else 1.0
     if searched < 1:
         landing = replace(
@@ -340,22 +353,14 @@ def fit_kinetics(
             per_second_high=landing.per_second_high / searched,
         )
     if searched < _SEARCHED:
-        notes.append(
-            f"{searched:.0%} of field and time were searched, and the rate of landing is for all "
-            "of it"
-        )
+        findings.append(PARTLY_SEARCHED({"share": searched}))
     unbinding = _unbinding(table, inside, stop, frame_rate_hz, radius_px)
-    if landing.p_value < 0.01:
-        notes.append(
-            f"landings are not as an exponential depletion has them (p = {landing.p_value:.1g}): "
-            "the rate in the beginning is that of a law that does not hold"
-        )
+    if landing.p_value < _WRONG:
+        findings.append(NO_DEPLETION_LAW({"p_value": landing.p_value}))
     if unbinding is not None and unbinding.chance_pairs > _CHANCE * max(unbinding.pairs, 1):
-        notes.append(
-            f"{unbinding.chance_pairs} of {unbinding.pairs} pairs are as many as chance makes: the "
-            "field is too crowded for `radius_px`, or particles stay"
-        )
-    return Kinetics(landing, unbinding, frame_rate_hz, (start, stop), tuple(notes))
+        values = {"chance": unbinding.chance_pairs, "pairs": unbinding.pairs}
+        findings.append(CHANCE_PAIRS(values))
+    return Kinetics(landing, unbinding, frame_rate_hz, (start, stop), tuple(findings))
 
 
 def configured_frame_rate(path: Path) -> float | None:

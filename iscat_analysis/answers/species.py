@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Unpack
 
 import numpy as np
 import pandas as pd
 
 from iscat_analysis.answers.kinetics import Kinetics
-from iscat_analysis.calibration.line import Line
+from iscat_analysis.answers.output import Notify, folder_for, tell, write_answer
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference.checks import choice_in, number_in, path_in, shown, truth_in
-from iscat_analysis.report import atomic_folder, check_output
+from iscat_analysis.inference.checks import choice_in, number_in, shown, truth_in
+from iscat_analysis.options import EventOptions, SpeciesOptions, only, takes
 from iscat_analysis.report.species import species_figure
-from iscat_analysis.report.style import drawn, publish
-from iscat_analysis.report.tables import CSV_DIGITS
-from iscat_analysis.schemas import jsonable, to_json
+from iscat_analysis.report.style import drawn
+from iscat_analysis.schemas import jsonable
 from iscat_analysis.species import LEAST_EVENTS, Distribution, describe
 from iscat_analysis.species.choices import (
     MOST_RUNGS,
@@ -28,9 +27,7 @@ from iscat_analysis.species.choices import (
     Ladder,
     Number,
     Searched,
-    Widths,
 )
-from iscat_analysis.species.describe import Branch
 from iscat_analysis.species.tables import EventTable, event_table, mass_in, refuse_far, sentences
 from iscat_analysis.units import count
 
@@ -42,30 +39,17 @@ _MOST_SPECIES = 1000
 _MOST_DRAWS = 1_000_000
 
 
+@takes(SpeciesOptions)
 def find_species(
     events: str | Path | pd.DataFrame | EventTable,
     *,
-    k: int | None = None,
-    masses_kda: Sequence[float] | None = None,
-    start_kda: Sequence[float] | None = None,
-    ladder: float | Literal["auto"] | None = None,
-    steps: Sequence[int] = (),
-    offset: bool = False,
-    hold: bool = False,
-    widths: Widths = "free",
-    background: bool = True,
-    branch: Branch = "magnitude",
-    sigma_kda: float | None = None,
-    limit_kda: float | None = None,
-    limit_sigma_kda: float | None = None,
-    above_kda: float | None = None,
-    calibration: Line | None = None,
     kinetics: Kinetics | None = None,
     draws: int = 100,
     seed: int = 1,
     out: str | Path | None = None,
     overwrite: bool = False,
-    notify: Callable[[str], None] | None = None,
+    notify: Notify | None = None,
+    **options: Unpack[SpeciesOptions],
 ) -> Distribution:
     """Find the species of a table of events, each event with its own error.
 
@@ -75,33 +59,6 @@ def find_species(
         An output folder, ``fits.csv``, a table of Refeyn's, or a table with a column ``mass_kda``.
         ``FILE::movie`` is one of several movies of a file, whose events are otherwise taken
         together.
-    k : int, optional
-        So many species; by default as many as the Bayesian information criterion likes.
-    masses_kda : sequence of float, optional
-        Species of these masses, held [kDa].
-    start_kda : sequence of float, optional
-        Species of free masses, as many as there are numbers; the fit begins at these and takes the
-        nearest maximum of the likelihood [kDa].
-    ladder : float or "auto", optional
-        Oligomers of a monomer of about this mass [kDa], which is fitted, or of one to be found.
-    steps : sequence of int
-        Which oligomers, as in (1, 2, 4); by default they are found.
-    offset : bool
-        Fit an offset common to all oligomers.
-    hold : bool
-        Hold the monomer at the mass given.
-    widths : {"free", "common"}
-        Of given masses and ladders: a width for each, which grow with the mass about as in other
-        tables, or one for all.
-    background : bool
-        Of given masses and ladders: whether something else may be there, broad and faint.
-    branch : {"magnitude", "landing", "leaving"}
-        Which events: |mass| of all, or one side.
-    sigma_kda, limit_kda, limit_sigma_kda, above_kda : float, optional
-        What is known of errors and of what was missed, as for `event_table` [kDa].
-    calibration : str, Path, Calibration or MassCalibration, optional
-        A mass line, as ``iscat calibrate mass`` writes it: masses are those of the contrasts, in
-        place of masses that the table has.
     kinetics : Kinetics, optional
         Rates of the same table, from `fit_kinetics`, to be written beside the species.
     draws : int
@@ -114,6 +71,7 @@ def find_species(
         Replace an earlier result in `out`.
     notify : callable, optional
         Given each note, a sentence.
+    **options
 
     Returns
     -------
@@ -137,39 +95,16 @@ def find_species(
     >>> round(found.ladder.monomer_kda), found.ladder.steps
     (66, (1, 2))
     """
-    choice = choice_of(
-        k, masses_kda, ladder, steps=steps, offset=offset, hold=hold, widths=widths,
-        background=background, start_kda=start_kda,
-    )  # fmt: skip
+    choice = choice_of(options)
     draws = int(number_in("`draws`", draws, least=0, most=_MOST_DRAWS, whole=True))
     seed = int(number_in("`seed`", seed, least=0, whole=True))
     if kinetics is not None and not isinstance(kinetics, Kinetics):
         raise ConfigError(f"`kinetics` = {shown(kinetics)}: give what `fit_kinetics` returns")
+    branch = options["branch"]
     choice_in("`branch`", branch, ("magnitude", "landing", "leaving"))
-    folder = None if out is None else path_in("`out`", out)
-    if folder is not None:
-        check_output(folder, overwrite, known=SPECIES_FILES)
-    table = events
-    if not isinstance(table, EventTable):
-        table = event_table(
-            table, sigma_kda=sigma_kda, limit_kda=limit_kda, limit_sigma_kda=limit_sigma_kda,
-            above_kda=above_kda, calibration=calibration,
-        )  # fmt: skip
-    wanted, fewer = k or 0, "a smaller `k`"
-    if isinstance(choice, Begun):
-        wanted, fewer = len(choice.masses_kda), "fewer in `start_kda`"
-    if table.mass_kda.size < _EVENTS_EACH * wanted:
-        raise DataError(
-            f"{table.name}: holds {count(table.mass_kda.size, 'event')}, too few for {wanted} "
-            f"species, which need {_EVENTS_EACH} each; give {fewer}"
-        )
-    if isinstance(choice, (Begun, Given)):
-        argument = "`masses_kda`" if isinstance(choice, Given) else "`start_kda`"
-        refuse_far([table], choice.masses_kda, argument)
-    elif isinstance(choice, Ladder) and choice.monomer_kda is not None:
-        rungs = choice.steps or (1, MOST_RUNGS)
-        monomer = choice.monomer_kda
-        refuse_far([table], [n * monomer for n in rungs], f"`ladder` = {monomer:.4g}")
+    folder = folder_for(out, SPECIES_FILES, overwrite=overwrite)
+    table = event_table(events, **only(EventOptions, options))
+    _refuse_impossible(table, choice)
     found = describe(
         table.mass_kda,
         table.sigma_kda,
@@ -188,47 +123,51 @@ def find_species(
             f"{table.name}: holds {count(found.events, kind)}, too few for species; "
             f"{LEAST_EVENTS} are needed"
         )
-    notes = (*sentences(table.remarks), *found.notes, *(() if kinetics is None else kinetics.notes))
-    if notify is not None:
-        for note in notes:
-            notify(note)
-    if folder is not None:
-        contents = {"source": table.name, **found.to_dict(), "notes": list(notes)}
-        if kinetics is not None:
-            contents["kinetics"] = kinetics.to_dict()
-        _write(folder, found.species, contents, overwrite=overwrite)
+    rates = () if kinetics is None else kinetics.notes
+    notes = [*sentences(table.remarks), *found.notes, *rates]
+    tell(notes, notify)
+    contents = {"source": table.name, **found.to_dict(), "notes": notes}
+    if kinetics is not None:
+        contents["kinetics"] = kinetics.to_dict()
+    files = {"species.csv": found.species, "species.json": ("species", contents)}
+    sketch = ("species", partial(species_figure, jsonable(contents)))
+    write_answer(folder, SPECIES_FILES, files, lambda: drawn([sketch]), overwrite=overwrite)
     return found
 
 
-def choice_of(
-    k: int | None,
-    masses_kda: Sequence[float] | None,
-    ladder: float | Literal["auto"] | None,
-    *,
-    steps: Sequence[int],
-    offset: bool,
-    hold: bool,
-    widths: Widths,
-    background: bool,
-    start_kda: Sequence[float] | None = None,
-) -> Choice:
-    """Say which species to look for, and refuse what is impossible."""
-    named = [
-        name
-        for name, value in (
-            ("k", k),
-            ("masses_kda", masses_kda),
-            ("start_kda", start_kda),
-            ("ladder", ladder),
+def _refuse_impossible(table: EventTable, choice: Choice) -> None:
+    """Refuse more species than events can tell, and masses without an event near them."""
+    number, fewer = (choice.k, "a smaller `k`") if isinstance(choice, Number) else (0, "")
+    if isinstance(choice, Begun):
+        number, fewer = len(choice.masses_kda), "fewer in `start_kda`"
+    if table.mass_kda.size < _EVENTS_EACH * number:
+        raise DataError(
+            f"{table.name}: holds {count(table.mass_kda.size, 'event')}, too few for {number} "
+            f"species, which need {_EVENTS_EACH} each; give {fewer}"
         )
-        if value is not None
-    ]
+    if isinstance(choice, (Begun, Given)):
+        argument = "`masses_kda`" if isinstance(choice, Given) else "`start_kda`"
+        refuse_far([table], choice.masses_kda, argument)
+    elif isinstance(choice, Ladder) and choice.monomer_kda is not None:
+        monomer = choice.monomer_kda
+        rungs = [n * monomer for n in choice.steps or (1, MOST_RUNGS)]
+        refuse_far([table], rungs, f"`ladder` = {monomer:.4g}")
+
+
+def choice_of(options: SpeciesOptions) -> Choice:
+    """Say which species to look for, and refuse what is impossible."""
+    k, ladder, steps = options["k"], options["ladder"], options["steps"]
+    masses_kda, start_kda = options["masses_kda"], options["start_kda"]
+    given = {"k": k, "masses_kda": masses_kda, "start_kda": start_kda, "ladder": ladder}
+    named = [name for name, value in given.items() if value is not None]
     if len(named) > 1:
         raise ConfigError(
             f"`{named[0]}` and `{named[1]}` are two descriptions of the species; give one of them"
         )
+    offset, hold, background = options["offset"], options["hold"], options["background"]
     for name, value in (("offset", offset), ("hold", hold), ("background", background)):
         truth_in(f"`{name}`", value)
+    widths = options["widths"]
     choice_in("`widths`", widths, ("common", "free"))
     for name, several in (("masses_kda", masses_kda), ("start_kda", start_kda), ("steps", steps)):
         if several is not None and not isinstance(several, (list, tuple, np.ndarray)):
@@ -264,15 +203,3 @@ def _masses(name: str, given: Sequence[float]) -> tuple[float, ...]:
     if len(set(masses)) < len(masses):
         raise ConfigError(f"{name}: names a mass twice; name each once")
     return masses
-
-
-def _write(
-    folder: Path, species: pd.DataFrame, contents: dict[str, Any], *, overwrite: bool
-) -> None:
-    """Put table, document and figure into a folder."""
-    with atomic_folder(folder, overwrite, known=SPECIES_FILES) as building:
-        species.to_csv(building / "species.csv", index=False, float_format=f"%.{CSV_DIGITS}g")
-        (building / "species.json").write_text(to_json("species", contents) + "\n", "utf-8")
-        (building / "figures").mkdir()
-        sketch = ("species", partial(species_figure, jsonable(contents)))
-        publish(drawn([sketch]), building / "figures")

@@ -24,6 +24,7 @@ from scipy.special import chdtrc, ndtr
 
 from iscat_analysis.calibration.line import ContrastPeak, Landing, MassCalibration
 from iscat_analysis.errors import ConfigError, DataError, SignError
+from iscat_analysis.findings.tables import STANDARDS_SCATTER, TWO_STANDARDS
 from iscat_analysis.records import FloatArray
 from iscat_analysis.units import count
 
@@ -440,14 +441,11 @@ def calibrate_mass(
         raise max(refusals, key=lambda each: each[0])[1]
     _refuse_unlikely(line.slope, float(size.max()), masses, name)
     widen = max(1.0, line.chi2 / line.dof) if line.dof else 1.0
-    notes = []
+    findings = []
     if widen > 1:
-        notes.append(
-            f"the standards scatter about the line by more than their errors (χ²/dof = "
-            f"{widen:.3g}); its uncertainty is widened by {math.sqrt(widen):.3g}"
-        )
+        findings.append(STANDARDS_SCATTER({"chi2_per_dof": widen, "widened": math.sqrt(widen)}))
     if not line.dof:
-        notes.append("two standards fix a line but cannot test it; a third would")
+        findings.append(TWO_STANDARDS())
     result = MassCalibration(
         gradient_per_kda=line.slope,
         offset=line.intercept,
@@ -458,7 +456,7 @@ def calibrate_mass(
         peaks=tuple(peaks),
         landing=landing,
         events=int(size.size),
-        notes=tuple(notes),
+        findings=tuple(findings),
     )
     return replace(result, standards=_table(result, chosen, masses, masses_se, direction))
 

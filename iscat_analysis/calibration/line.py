@@ -36,6 +36,7 @@ from iscat_analysis.config import (
     toml_value,
 )
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.findings import Finding
 from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, forward_model
 from iscat_analysis.reading import is_file, is_folder
 from iscat_analysis.records import FloatArray, Status
@@ -100,8 +101,13 @@ class MassCalibration:
     peaks: tuple[ContrastPeak, ...]
     landing: Landing
     events: int
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     recorded: Standards | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences of the findings."""
+        return tuple(finding.text for finding in self.findings)
 
     def mass_kda(self, contrast: ArrayLike) -> FloatArray:
         """Convert signed peak contrasts to masses."""
@@ -337,8 +343,10 @@ def measured_contrasts(table: pd.DataFrame, source: object) -> pd.DataFrame:
     return table
 
 
-def weighed(table: pd.DataFrame, line: Calibration, source: object) -> tuple[pd.DataFrame, str]:
-    """Give the events of a table the masses of a line, and say what of its own masses is replaced.
+def weighed(
+    table: pd.DataFrame, line: Calibration, source: object
+) -> tuple[pd.DataFrame, float | None]:
+    """Give the events of a table the masses of a line, and how many times its own they are.
 
     Where the optics of both are known, the model converts the line from one to the other.
     """
@@ -362,9 +370,7 @@ def weighed(table: pd.DataFrame, line: Calibration, source: object) -> tuple[pd.
         made["status"] = Status.OK.value
     known = np.isfinite(own) & np.isfinite(mass) & (own != 0)
     times = float(np.median(np.abs(mass[known] / own[known]))) if known.any() else 1.0
-    if abs(times - 1) < _SAME:
-        return made, ""
-    return made, f"masses are those of `calibration`, {times:.4g} times the table's own (median)"
+    return made, None if abs(times - 1) < _SAME else times
 
 
 def _covariance(line: Calibration) -> FloatArray:

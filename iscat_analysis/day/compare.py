@@ -30,6 +30,7 @@ from iscat_analysis.answers.binding import (
 )
 from iscat_analysis.day.gather import Found
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.findings import existing
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species import LEAST_EVENTS
 from iscat_analysis.species.equilibrium import Model
@@ -310,7 +311,8 @@ def _fit(
 ) -> Series:
     """Fit all movies of a condition that have enough events."""
     tables = [event_table(each.folder, name=each.movie.name) for each in members]
-    kept, remarks = with_events(tables)
+    kept, few = with_events(tables)
+    remarks = tuple(finding.text for finding in existing([few]))
     used = [each for each, keep in zip(members, kept, strict=True) if keep]
     if not used:
         return Series(condition, 0, None, why=f"no movie has {LEAST_EVENTS} events")

@@ -8,13 +8,14 @@ that stand in the sentence.  One place prints them, the page sorts them by sever
 
 from __future__ import annotations
 
-from iscat_analysis.findings import camera, files, particles
+from iscat_analysis.findings import camera, files, particles, tables
 from iscat_analysis.findings.registry import (
     KINDS,
     Finding,
     FindingKind,
     Findings,
     Severity,
+    Value,
     aside,
     define,
     existing,
@@ -25,6 +26,6 @@ from iscat_analysis.findings.registry import (
 )
 
 __all__ = [
-    "KINDS", "Finding", "FindingKind", "Findings", "Severity", "aside", "camera", "define",
-    "existing", "files", "particles", "printing", "remark", "unreported", "warnings_in",
+    "KINDS", "Finding", "FindingKind", "Findings", "Severity", "Value", "aside", "camera", "define",
+    "existing", "files", "particles", "printing", "remark", "tables", "unreported", "warnings_in",
 ]  # fmt: skip

@@ -37,6 +37,7 @@ from iscat_analysis.diagnosis import (
 from iscat_analysis.executors import versions
 from iscat_analysis.findings import Finding, remark
 from iscat_analysis.findings.particles import SPREAD_NOT_MEASURED
+from iscat_analysis.findings.tables import SPHERES_MISSED, TRACKS_LEFT_OUT
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Run
@@ -353,19 +354,17 @@ def _sizes(context: AnalysisContext, table: pd.DataFrame) -> Sizes | None:
     diameter, sigma, snr = (
         good[name].to_numpy(float) for name in ("diameter_nm", "sigma_diameter_nm", "snr")
     )
-    notes = []
+    findings = []
     near = diameter[snr < context.templates.threshold + _CLEAR_OF_THRESHOLD]
     if near.size:
-        notes.append(
-            f"{count(near.size, 'sphere')} of {number(near.min())} to {number(near.max())} nm "
-            f"{'is' if near.size == 1 else 'are'} hardly brighter than what is detected: others of "
-            "such diameters were missed, for which nothing is corrected"
-        )
+        ends = {"least_nm": number(near.min()), "most_nm": number(near.max())}
+        ends |= {"amount": count(near.size, "sphere"), "verb": "is" if near.size == 1 else "are"}
+        findings.append(SPHERES_MISSED(ends))
     common = 0.0
     if "systematic_diameter_nm" in good:
         common = _median(good["systematic_diameter_nm"] / good["diameter_nm"]) or 0.0
     return describe_sizes(
-        diameter, sigma, seed=context.config.compute.seed, common=common, notes=notes
+        diameter, sigma, seed=context.config.compute.seed, common=common, findings=findings
     )
 
 
@@ -379,12 +378,10 @@ def sizes_of_tracks(tracks: pd.DataFrame, seed: int) -> Sizes | None:
         return None
     flags = tracks["flags"].astype(str).str.split(";")
     good = tracks[[not _NO_SIZE & set(each) for each in flags]]
-    notes = []
+    findings = []
     if len(good) < len(tracks):
-        notes.append(
-            f"{count(len(tracks) - len(good), 'track')} of {len(tracks)} left out, of which "
-            "pictures do not tell the diameter, or do not agree on it"
-        )
+        left_out = count(len(tracks) - len(good), "track")
+        findings.append(TRACKS_LEFT_OUT({"amount": left_out, "tracks": len(tracks)}))
     common = 0.0
     if "systematic_mass_kda" in good:  # a third, as the mass goes with the cube of the diameter
         common = (_median(good["systematic_mass_kda"] / good["mass_kda"]) or 0.0) / 3
@@ -393,7 +390,7 @@ def sizes_of_tracks(tracks: pd.DataFrame, seed: int) -> Sizes | None:
         good["sigma_optical_diameter_nm"].to_numpy(float),
         seed=seed,
         common=common,
-        notes=notes,
+        findings=findings,
     )
 
 

@@ -6,7 +6,7 @@ What is drawn: a histogram, a kernel density and the species as curves.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -15,6 +15,19 @@ import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.special import gammaincinv, logsumexp, ndtr
 
+from iscat_analysis.findings import Finding, Value, existing
+from iscat_analysis.findings.tables import (
+    BRIEF_VISITORS,
+    BROAD_SPECIES,
+    HALF_DETECTED,
+    NO_ERROR_OR_MASS,
+    NO_LADDER,
+    OUTLIERS,
+    SKEWED_PEAK,
+    TOO_FEW_EVENTS,
+    UNDETECTABLE,
+    UNDETERMINED_SHARE,
+)
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.species.choices import Choice, Chosen, Ladder, LadderFit, Searched, peaks
 from iscat_analysis.species.events import Efficiency, Events, possible
@@ -92,8 +105,8 @@ class Distribution:
         ``"magnitude"``, ``"landing"`` or ``"leaving"``.
     draws, seed : int
         Of the bootstrap.
-    notes : tuple of str
-        What the user should know, one sentence each.
+    findings : tuple of Finding
+        What the user should know.
     ladder : LadderFit or None
         The monomer, where species are a ladder.
     """
@@ -108,8 +121,13 @@ class Distribution:
     branch: Branch
     draws: int
     seed: int
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     ladder: LadderFit | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences of the findings."""
+        return tuple(finding.text for finding in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
         """Give what ``summary.json`` holds under ``distribution``.
@@ -171,15 +189,15 @@ def describe(
     usable = possible(mass, sigma)
     if branch != "magnitude":
         usable &= (mass > 0) == (branch == "landing")
-    notes = []
+    findings = []
     if branch == "magnitude" and np.count_nonzero(~usable):
         left_out = count(int(np.count_nonzero(~usable)), "event")
-        notes.append(f"{left_out} without a mass and an error left out")
+        findings.append(NO_ERROR_OR_MASS({"amount": left_out}))
     events = Events(np.abs(mass[usable]), sigma[usable], efficiency if limit_known else None)
     if events.x.size < LEAST_EVENTS:
-        held = count(events.x.size, "event")
-        notes.append(f"{held}, too few for species; {LEAST_EVENTS} are needed")
-        return _undescribed(events, branch, draws, seed, notes)
+        few: dict[str, Value] = {"amount": count(events.x.size, "event"), "needed": LEAST_EVENTS}
+        findings.append(TOO_FEW_EVENTS(few))
+        return _undescribed(events, branch, draws, seed, findings)
 
     choice = choice or Searched()
     found = choice.choose(events)
@@ -208,12 +226,11 @@ def describe(
         branch=branch,
         draws=draws,
         seed=seed,
-        notes=(
-            *notes,
+        findings=(
+            *findings,
             *_skews(best, species),
             *_remarks(species, doubtful),
-            *_brief(species, window_frames),
-            *_doubts(ladder),
+            *existing([_brief(species, window_frames), _doubt(ladder)]),
         ),
         ladder=ladder,
     )
@@ -351,15 +368,11 @@ def _ladder(
     )  # fmt: skip
 
 
-def _doubts(ladder: LadderFit | None) -> list[str]:
-    """List reasons why the masses may be no ladder."""
+def _doubt(ladder: LadderFit | None) -> Finding | None:
+    """Say where masses are no ladder."""
     if ladder is None or not ladder.p_value < _NO_LADDER:
-        return []
-    return [
-        f"the species do not lie at multiples of {ladder.monomer_kda:.4g} kDa (p = "
-        f"{ladder.p_value:.1g} against free masses): give them an `offset`, say what is missed of "
-        "the lightest with `limit_kda` or `above_kda`, or calibrate the mass scale anew"
-    ]
+        return None
+    return NO_LADDER({"monomer_kda": ladder.monomer_kda, "p_value": ladder.p_value})
 
 
 def _residence(events: Events, mass: FloatArray, window_frames: int | None) -> FloatArray:
@@ -377,79 +390,54 @@ def widening(reach: FloatArray, scale: FloatArray) -> FloatArray:
     return np.asarray(np.hypot(reach, TWO_SIDED_95 * scale) - reach)
 
 
-def _skews(best: Mixture, species: pd.DataFrame) -> list[str]:
+def _skews(best: Mixture, species: pd.DataFrame) -> Iterator[Finding]:
     """Name the peaks that more than one component describes."""
-    said = []
     for number in range(best.species):
         own = np.flatnonzero(best.kinds == number)
         mass, mean = species["mass_kda"][number], species["mean_kda"][number]
         if own.size > 1 and not species["outlier"][number]:
             beside = best.mean[own[np.argmax(np.abs(best.mean[own] - mass))]]
             means = "" if abs(mean / mass - 1) < _SKEWED else f", and its mean is {mean:.4g} kDa"
-            said.append(
-                f"the peak at {mass:.4g} kDa is one species, and skewed: a second component near "
-                f"{beside:.3g} kDa describes it better{means}"
-            )
-    return said
+            masses = {"mass_kda": float(mass), "beside_kda": float(beside)}
+            yield SKEWED_PEAK(masses | {"mean": means})
 
 
-def _remarks(species: pd.DataFrame, doubtful: BoolArray) -> list[str]:
-    """List reasons to doubt single species."""
+def _remarks(species: pd.DataFrame, doubtful: BoolArray) -> Iterator[Finding]:
+    """Doubt single species."""
     species = species[: doubtful.size]
-    undetectable = (species["efficiency"] < LEAST_EFFICIENCY) & ~doubtful
-    cases = (
-        (
-            pd.Series(doubtful, index=species.index),
-            "what lies at {} kDa may be all that is seen of a lighter species: its mass and number "
-            f"are not determined, for its share is not known to a factor of {MOST_DOUBT:g}, and "
-            "fractions are of the others; `limit_kda` says what is detected, "
-            "or `above_kda` from where on everything is",
-        ),
-        (
-            undetectable,
-            f"of what lies at {{}} kDa or below fewer than {100 * LEAST_EFFICIENCY:g} % are "
-            "detected: its mass and number are not determined, and fractions are of the others",
-        ),
-        (
-            (species["efficiency"] < 0.5) & ~undetectable & ~doubtful,
-            "fewer than half of the particles of {} kDa are detected: their mass and number rest "
-            "on the detection model",
-        ),
-        (
-            species["outlier"],
-            f"at {{}} kDa there are fewer than {LEAST_SPECIES} events: outliers, and no species",
-        ),
-        (
-            species["width_kda"] > _MOST_RELATIVE_WIDTH * species["mass_kda"],
-            "the species at {} kDa is as broad as a background: it may hold all events that the "
-            "other species do not explain",
-        ),
-    )
-    return [
-        text.format(", ".join(f"{mass:.3g}" for mass in species["mass_kda"][which]))
-        for which, text in cases
-        if which.any()
-    ]
+    doubted = pd.Series(doubtful, index=species.index)
+    undetectable = (species["efficiency"] < LEAST_EFFICIENCY) & ~doubted
+    half = (species["efficiency"] < 0.5) & ~undetectable & ~doubted
+    broad = species["width_kda"] > _MOST_RELATIVE_WIDTH * species["mass_kda"]
+    limits: dict[str, Value] = {
+        "factor": MOST_DOUBT, "percent": 100 * LEAST_EFFICIENCY, "needed": LEAST_SPECIES,
+    }  # fmt: skip
+    for which, kind in (
+        (doubted, UNDETERMINED_SHARE),
+        (undetectable, UNDETECTABLE),
+        (half, HALF_DETECTED),
+        (species["outlier"], OUTLIERS),
+        (broad, BROAD_SPECIES),
+    ):
+        if which.any():
+            masses = ", ".join(f"{mass:.3g}" for mass in species["mass_kda"][which])
+            yield kind(limits | {"masses": masses})
 
 
-def _brief(species: pd.DataFrame, window_frames: int | None) -> list[str]:
+def _brief(species: pd.DataFrame, window_frames: int | None) -> Finding | None:
     """Say how long a particle must stay for its efficiency to be that of the table."""
     known = species[np.isfinite(species["stay_frames"].to_numpy(dtype=float)) & ~species["outlier"]]
     if window_frames is None or known.empty:
-        return []
+        return None
     residence = ", ".join(
         f"{row.mass_kda:.3g} kDa from {count(round(row.stay_frames), 'frame')}"
         for row in known.itertuples()
     )
-    return [
-        "efficiencies and corrected counts are of particles that stay "
-        f"{count(window_frames, 'frame')} or longer; briefer visitors are missed more often and "
-        f"appear lighter: every other one is found of {residence}"
-    ]
+    return BRIEF_VISITORS({"frames": count(window_frames, "frame"), "residence": residence})
 
 
 def _undescribed(
-    events: Events, branch: Branch, draws: int, seed: int, notes: Sequence[str]
+    events: Events, branch: Branch, draws: int, seed: int, findings: Sequence[Finding]
 ) -> Distribution:
     """Describe events that are too few for a mixture."""
     some = events.x.size > 0
@@ -464,7 +452,7 @@ def _undescribed(
         branch=branch,
         draws=draws,
         seed=seed,
-        notes=tuple(notes),
+        findings=tuple(findings),
     )
 
 

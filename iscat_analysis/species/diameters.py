@@ -25,7 +25,7 @@ What is not seen is not corrected for: the light of spheres is in no simple rela
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,6 +33,8 @@ import numpy as np
 import pandas as pd
 from scipy.special import logsumexp
 
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.tables import LARGE_DIAMETER_ERRORS, SPHERES_LEFT_OUT
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.species.choices import Searched
 from iscat_analysis.species.describe import (
@@ -88,7 +90,12 @@ class Sizes:
     spheres: int
     draws: int
     seed: int
-    notes: tuple[str, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences of the findings."""
+        return tuple(finding.text for finding in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
         """Give what ``summary.json`` holds under ``sizes``."""
@@ -112,7 +119,7 @@ def describe_sizes(
     seed: int,
     common: float = 0.0,
     draws: int = 100,
-    notes: Sequence[str] = (),
+    findings: Sequence[Finding] = (),
 ) -> Sizes | None:
     """Describe diameters as populations; `common` is the relative error that all share.
 
@@ -175,7 +182,7 @@ def describe_sizes(
         spheres=int(diameter.size),
         draws=draws,
         seed=seed,
-        notes=(*notes, *_doubts(known, power * sigma / diameter)),
+        findings=(*findings, *_doubts(known, power * sigma / diameter)),
     )
 
 
@@ -226,20 +233,13 @@ def _curve(events: Events, best: Mixture) -> pd.DataFrame:
     return pd.DataFrame({"diameter_nm": UNIT_NM * diameter, "model": density / UNIT_NM})
 
 
-def _doubts(known: BoolArray, skew: FloatArray) -> list[str]:
+def _doubts(known: BoolArray, skew: FloatArray) -> Iterator[Finding]:
     """Say which diameters are left out, and where errors are too large.
 
     Shapes: `known` (n,), `skew` (k,), of those that are known.
     """
-    doubts = []
     if left_out := int(np.count_nonzero(~known)):
-        doubts.append(
-            f"{count(left_out, 'sphere')} without a diameter, or with an error above "
-            f"{100 * LARGEST_ERROR:g} % of it, left out"
-        )
+        amount = count(left_out, "sphere")
+        yield SPHERES_LEFT_OUT({"amount": amount, "percent": 100 * LARGEST_ERROR})
     if np.median(np.abs(skew)) > LARGEST_SKEW:
-        doubts.append(
-            "the errors of the diameters are so large that those of their logarithms are not "
-            "normal: median and width are biased by a part of the errors; use more frames"
-        )
-    return doubts
+        yield LARGE_DIAMETER_ERRORS()

@@ -29,9 +29,18 @@ from scipy.special import log_ndtr
 
 from iscat_analysis.calibration.line import mass_line, weighed
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.tables import (
+    AS_READ,
+    MASSES_REPLACED,
+    NO_ERRORS,
+    NO_MASS,
+    REJECTED_BY_HAND,
+    UNKNOWN_LIMIT,
+)
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie.event_tables import named, read_events, unit_note
-from iscat_analysis.options import EventOptions, takes
+from iscat_analysis.options import EventOptions, only, takes
 from iscat_analysis.reading import read_json
 from iscat_analysis.records import FloatArray, species_rows
 from iscat_analysis.species.events import POSSIBLE_KDA, Efficiency, Events, possible
@@ -60,28 +69,20 @@ _REJECTED = "rejected_by_hand"  # true of events that somebody left out
 _NAMED = 3  # tables that a note names
 
 
-@dataclass(frozen=True)
-class Note:
-    """What the user should know of a table: a sentence that other tables may share."""
-
-    table: str
-    sentence: str
-    of_table: str = ""
-    """What is different in each table, as how many events are meant."""
-
-
-def sentences(notes: Iterable[Note]) -> list[str]:
+def sentences(findings: Iterable[Finding]) -> list[str]:
     """Write each sentence once, with the tables that it is about."""
     tables: dict[str, dict[tuple[str, str], None]] = {}
-    for note in notes:
-        tables.setdefault(note.sentence, {})[note.table, note.of_table] = None
+    for finding in findings:
+        shared = finding.kind({**finding.values, "amount": ""}).text.strip()
+        of_table = finding.where, str(finding.values.get("amount", ""))
+        tables.setdefault(shared, {})[of_table] = None
     found = []
     for sentence, about in tables.items():
-        named = [f"{name} ({own})" if own else name for name, own in about]
         if len(about) == 1:
-            ((name, own),) = about
-            found.append(f"{name}: {own} {sentence}" if own else f"{name}: {sentence}")
+            ((name, amount),) = about
+            found.append(f"{name}: {amount} {sentence}" if amount else f"{name}: {sentence}")
             continue
+        named = [f"{name} ({amount})" if amount else name for name, amount in about]
         more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
         found.append(f"{', '.join(named[:_NAMED])}{more}: {sentence}")
     return found
@@ -100,7 +101,7 @@ class EventTable:
     efficiency: Efficiency | None = None
     window_frames: int | None = None
     scale_error: Callable[[FloatArray], FloatArray] | None = None
-    notes: tuple[Note, ...] = ()
+    findings: tuple[Finding, ...] = ()
     edge_kda: float | None = None
     """The lightest event, where nothing but it tells what was missed."""
 
@@ -110,15 +111,12 @@ class EventTable:
         return Events(np.abs(self.mass_kda), self.sigma_kda, self.efficiency)
 
     @property
-    def remarks(self) -> tuple[Note, ...]:
-        """Notes for the user, with one where the lightest event stands for the limit."""
+    def remarks(self) -> tuple[Finding, ...]:
+        """Findings for the user, with one where the lightest event stands for the limit."""
         if self.edge_kda is None:
-            return self.notes
-        sentence = (
-            "there are no events, and nothing says what was missed of the lightest; `above_kda` "
-            "cuts where all are still detected, `limit_kda` says where half are"
-        )
-        return *self.notes, Note(self.name, sentence, f"below {self.edge_kda:.3g} kDa")
+            return self.findings
+        below = {"amount": f"below {self.edge_kda:.3g} kDa"}
+        return *self.findings, UNKNOWN_LIMIT(below, where=self.name)
 
 
 def mass_in(name: str, value: float, what: str = "mass in kDa") -> float:
@@ -143,16 +141,20 @@ def refuse_far(tables: Sequence[EventTable], masses_kda: Sequence[float], argume
 
 @takes(EventOptions)
 def event_table(
-    events: str | Path | pd.DataFrame, *, name: str | None = None, **options: Unpack[EventOptions]
+    events: str | Path | pd.DataFrame | EventTable,
+    *,
+    name: str | None = None,
+    **options: Unpack[EventOptions],
 ) -> EventTable:
-    """Take events from a file or a table in memory.
+    """Take events from a file or a table in memory; a table of events stays as it is.
 
     With `calibration` their masses are those of its line, from their contrasts, whatever masses
     the table has.
     """
+    given = only(EventOptions, options)
+    line = given.pop("calibration")
     sigma_kda, limit_kda, limit_sigma_kda, above_kda = (
-        None if options[key] is None else mass_in(f"`{key}`", options[key])
-        for key in ("sigma_kda", "limit_kda", "limit_sigma_kda", "above_kda")
+        None if value is None else mass_in(f"`{option}`", value) for option, value in given.items()
     )
     if limit_kda is not None and above_kda is not None:
         raise ConfigError(
@@ -160,6 +162,8 @@ def event_table(
         )
     if limit_sigma_kda is not None and limit_kda is None:
         raise ConfigError("`limit_sigma_kda` is the spread of a limit; give `limit_kda` as well")
+    if isinstance(events, EventTable):
+        return events
     if isinstance(events, pd.DataFrame):
         called = name or "table"
         table = named(events, called)
@@ -171,17 +175,17 @@ def event_table(
             f"`events`: is {type(events).__name__}; give the path of a table, or a pandas.DataFrame"
         )
     file = table.attrs.get("file")
-    said = [*table.attrs["notes"]]
-    if options["calibration"] is not None:
-        table, replaced = weighed(table, mass_line(options["calibration"]), called)
-        said += [replaced] if replaced else []
+    findings = [AS_READ({"text": note}) for note in table.attrs["notes"]]
+    if line is not None:
+        table, times = weighed(table, mass_line(line), called)
+        findings += [] if times is None else [MASSES_REPLACED({"times": times})]
     elif table["mass_kda"].isna().all() and table["contrast"].notna().any():
         raise DataError(
             f"{called}: has contrasts and no masses; give `calibration`, a mass line as iscat "
             "calibrate mass writes it"
         )
     if "status" not in table and (doubt := unit_note(table["mass_kda"].to_numpy(float))):
-        said.append(doubt)
+        findings.append(AS_READ({"text": doubt}))
     table = _checked(table)
     found = _usable(table, called, sigma_kda)
     efficiency = found.efficiency
@@ -197,8 +201,8 @@ def event_table(
     if efficiency is None:
         edge = float(np.abs(found.mass_kda).min())
         efficiency = _sharp(edge * (1 - 10 * _CUT_WIDTH))
-    notes = (*(Note(called, sentence) for sentence in said), *found.notes)
-    return replace(found, efficiency=efficiency, edge_kda=edge, notes=notes)
+    findings = [replace(finding, where=called) for finding in (*findings, *found.findings)]
+    return replace(found, efficiency=efficiency, edge_kda=edge, findings=tuple(findings))
 
 
 def filter_efficiency(
@@ -278,15 +282,15 @@ def _checked(table: pd.DataFrame) -> pd.DataFrame:
 
 def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTable:
     """Select rows with a mass and without a disqualifying flag."""
-    good, notes = table, []
+    good, findings = table, []
     if "status" in table:
         good, said = species_rows(table)
-        notes += [Note(name, sentence) for sentence in said]
+        findings += [AS_READ({"text": sentence}) for sentence in said]
         if good.empty:
             raise DataError(f"{name}: holds no event with status ok")
     if _REJECTED in good and (by_hand := int(good[_REJECTED].sum())):
         good = good[~good[_REJECTED]]
-        notes.append(Note(name, "that somebody rejected left out", count(by_hand, "event")))
+        findings.append(REJECTED_BY_HAND({"amount": count(by_hand, "event")}))
     mass, sigma, frame, x, y = (
         good[column].to_numpy(np.float64) if column in good else np.full(len(good), math.nan)
         for column in ("mass_kda", "sigma_mass_kda", "frame", "x_px", "y_px")
@@ -295,23 +299,20 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
         sigma = np.full(mass.shape, sigma_kda)
     elif not np.isfinite(sigma[np.isfinite(mass)]).any():
         sigma = np.full(mass.shape, UNKNOWN_SIGMA_KDA)
-        sentence = (
-            "no event has an error of its own, so that the width of a species holds the errors; "
-            "`sigma_kda` gives them one"
-        )
-        notes.append(Note(name, sentence))
+        findings.append(NO_ERRORS())
     known = possible(mass, sigma)
-    between = "between {:g} and {:g} kDa".format(*POSSIBLE_KDA)
+    least, most = POSSIBLE_KDA
     if not known.any():
         raise DataError(
-            f"{name}: holds no event with a mass and an error {between}; fit the masses (mode mass "
-            "or joint) or export the table with masses"
+            f"{name}: holds no event with a mass and an error between {least:g} and "
+            f"{most:g} kDa; fit the masses (mode mass or joint) or export the table with masses"
         )
     if missing := int(np.count_nonzero(~known)):
-        sentence = f"without a mass and an error {between} left out"
+        advice = ""
         if good["contrast"][~known].notna().any():
-            sentence += "; `calibration` gives them the mass of their contrast"
-        notes.append(Note(name, sentence, count(missing, "event")))
+            advice = "; `calibration` gives them the mass of their contrast"
+        limits = {"least": least, "most": most}
+        findings.append(NO_MASS({"amount": count(missing, "event"), "advice": advice, **limits}))
     rows = good[known]
     window = (
         int(rows["n_after"].max()) if "n_after" in rows and rows["n_after"].notna().any() else 0
@@ -325,7 +326,7 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
         y[known],
         window_frames=window or None,
         scale_error=shared_error(rows),
-        notes=tuple(notes),
+        findings=tuple(findings),
     )
 
 

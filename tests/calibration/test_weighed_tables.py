@@ -52,11 +52,11 @@ def test_contrasts_alone_and_masses_that_are_missing(
         for given in (line, line.parent, str(line)):
             found = event_table(path, calibration=given)
             np.testing.assert_allclose(found.mass_kda, mass, rtol=1e-9)
-            assert not any("calibration" in note for note in sentences(found.notes))
+            assert not any("calibration" in note for note in sentences(found.findings))
         with pytest.raises(ia.DataError, match=r"has contrasts and no masses; give `calibration`"):
             event_table(path)
     some = alone.assign(masses_kDa=np.where(mass > 0, mass, np.nan))
-    (note,) = [n for n in sentences(event_table(some).notes) if "left out" in n]
+    (note,) = [n for n in sentences(event_table(some).findings) if "left out" in n]
     assert "`calibration` gives them the mass of their contrast" in note
 
 
@@ -65,7 +65,7 @@ def test_masses_of_the_table_are_replaced_and_that_is_said(mass: np.ndarray, lin
     found = event_table(table, calibration=line)
     np.testing.assert_allclose(found.mass_kda, mass, rtol=1e-9)
     assert "table: masses are those of `calibration`, 0.5 times the table's own (median)" in (
-        sentences(found.notes)
+        sentences(found.findings)
     )
     with pytest.raises(ia.DataError, match="table: has masses and no contrasts"):
         event_table(table[["mass_kda"]], calibration=line)

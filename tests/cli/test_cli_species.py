@@ -122,7 +122,7 @@ def test_samples_are_compared_with_the_first(events: Path, tmp_path: Path, capsy
 
 
 @pytest.mark.parametrize(
-    "option", ["--offset", "--hold", "--branch=landing", "--widths=free", "--start=66"]
+    "option", ["--offset", "--hold", "--branch=landing", "--widths=common", "--start=66"]
 )
 def test_what_is_for_one_table_is_refused_for_two(option: str, events: Path, capsys) -> None:
     assert main(["species", str(events), str(events), "--ladder", "66", option]) == 2

@@ -10,6 +10,7 @@ import pytest
 from markupsafe import Markup
 
 import iscat_analysis as ia
+from iscat_analysis.findings.tables import TWO_STANDARDS
 from iscat_analysis.pipeline.finish import sizes_of_tracks
 from iscat_analysis.records import FloatArray
 from iscat_analysis.report.species import sizes_figure, sizes_section
@@ -59,9 +60,10 @@ def test_median_and_width_are_those_of_the_population(light: bool) -> None:
 def test_two_populations_have_fractions_intervals_and_a_common_error() -> None:
     (small, small_error), (large, large_error) = draw(3, 150, 0.03), draw(4, 75, 0.03)
     diameter, sigma = np.append(small, 2 * large), np.append(small_error, 2 * large_error)
-    sizes = describe_sizes(diameter, sigma, seed=1, draws=20, common=0.05, notes=["a note"])
+    known = [TWO_STANDARDS()]
+    sizes = describe_sizes(diameter, sigma, seed=1, draws=20, common=0.05, findings=known)
     assert sizes is not None
-    assert sizes.notes[0] == "a note"
+    assert sizes.findings[0].code == "two-standards"
     table = sizes.populations
     for name, truth in (
         ("diameter", [100, 200]), ("geometric_sd", [1.12, 1.12]), ("fraction", [2 / 3, 1 / 3])
