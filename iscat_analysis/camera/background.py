@@ -28,10 +28,8 @@ DEFECT_SIGMAS = 6.0
 """Unless noise alone could have put it there: dark backgrounds scatter by more than their mean."""
 
 _BLOCK_BYTES = 16 * 2**20
-_CLIP_SIGMAS = 3.0
 _NEIGHBOURS = 5  # pixels along each side, whose median tells what a pixel should hold
 _NEIGHBOURHOOD = 7  # pixels, on which a faint background is averaged for the weights
-_LARGEST_SIGNAL_SHARE = 0.1
 _LEAST_TOTAL_E = 1e6  # fewer background photoelectrons leave the power uncertain by over 0.1 %
 
 Check = Callable[[NDArray[Any], int], None]
@@ -132,7 +130,8 @@ def refine_power(windows: Windows, explained: FloatArray, *, additive: bool) -> 
     """
     used = ~windows.masked
     if additive:
-        used &= explained < _LARGEST_SIGNAL_SHARE * windows.power_ratio * windows.before_e
+        # a tenth of the light or more is a particle
+        used &= explained < 0.1 * windows.power_ratio * windows.before_e
     if windows.before_e[used].sum() < _LEAST_TOTAL_E:
         return windows
     after, before = windows.after_e[used], windows.before_e[used]
@@ -284,7 +283,7 @@ def _robust_ratio(windows: Windows) -> float:
         variance = ratio * before * (1 + (0 if known else ratio))
         variance = variance + windows.read_variance_after_e2[used]
         off = np.abs(after - ratio * before) / np.sqrt(np.maximum(variance, 1.0))
-        clip = _CLIP_SIGMAS * max(1.0, float(np.median(off[kept])) / 0.6745)
+        clip = 3.0 * max(1.0, float(np.median(off[kept])) / 0.6745)  # robust standard deviations
         kept_now = off < clip
         if np.array_equal(kept_now, kept) or kept_now.sum() < 0.1 * kept.size:
             break

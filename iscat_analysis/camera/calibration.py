@@ -65,10 +65,6 @@ NOISE_COLUMNS = (
 )  # fmt: skip
 """Columns of `CameraCalibration.noise`."""
 
-_SIGMAS = 3.0
-_COMPARISONS = 64  # at each length: more would not narrow the curve noticeably
-_MEDIAN_VARIANCE = 2.333  # relative standard error of a variance from a median, times √n
-
 
 def noise_curve(
     stack: FrameSource, found: Moments, used: BoolArray, result: Solution, progress: Progress
@@ -89,7 +85,8 @@ def noise_curve(
     predicted = np.maximum(result.intercept + result.slope * found.mean[used], 1e-12) / light**2
     shot = result.slope / light
     levels = int(math.log2(frames // 2))
-    strides = [max(1, -(-(frames // 2**j - 1) // _COMPARISONS)) for j in range(levels + 1)]
+    # at each length: more would not narrow the curve noticeably
+    strides = [max(1, -(-(frames // 2**j - 1) // 64)) for j in range(levels + 1)]
     waiting: list[FloatArray | None] = [None] * (levels + 1)
     last: list[FloatArray | None] = [None] * (levels + 1)
     seen = [0] * (levels + 1)
@@ -121,7 +118,8 @@ def noise_curve(
         n = 2**j
         excess = float(np.mean(values)) * scale
         pixels = light.size
-        se = excess * _MEDIAN_VARIANCE * math.sqrt(1.5 / (pixels * len(values)))
+        # relative standard error of a variance from a median, times √n
+        se = excess * 2.333 * math.sqrt(1.5 / (pixels * len(values)))
         noise = math.sqrt(2 * float(shot.mean()) / n)
         rows.append(
             (n, noise * math.sqrt(excess), noise * se / (2 * math.sqrt(excess)), noise,
@@ -132,7 +130,7 @@ def noise_curve(
 
 def verdict_of(noise: pd.DataFrame) -> tuple[int, str]:
     """Say up to which average the noise is shot noise."""
-    within = noise["excess"] <= 1 + LEAST_EXCESS_VARIANCE + _SIGMAS * noise["excess_se"]
+    within = noise["excess"] <= 1 + LEAST_EXCESS_VARIANCE + 3.0 * noise["excess_se"]
     first = noise.iloc[0]
     if not within.iloc[0]:
         return 0, (
@@ -161,10 +159,6 @@ LEAST_FRAMES_FOR_MAPS = 100
 """Fewer leave the gain of one pixel uncertain by more than 17 %."""
 
 _LEAST_PIXELS = 64
-_SPECTRUM_FRAMES = 128  # on which correlations of pixels are measured
-_MOST_CLIPPED_SHARE = 0.01  # of a dark's pixels at zero that are worth a line
-_MOST_CHI2_REDUCED = 3.0  # reduced χ² of the photon-transfer curve
-_NAMED = 4  # frames that a note about repeated ones names
 _CURVE_COLUMNS = ["mean_adu", "variance_adu2", "variance_se", "fit_adu2", "pixels"]
 
 
@@ -198,7 +192,7 @@ def measure_camera(
         masked["hot"] |= stand_out(dark_found.mean) | stand_out(dark_found.variance)
         masked["dead"] |= dark_found.variance <= 0
         low = float(np.mean(clipped(dark_found.lowest)))
-        if low > _MOST_CLIPPED_SHARE:
+        if low > 0.01:  # that are worth a line
             notes.append(
                 f"{100 * low:.0f} % of the dark's pixels reach zero counts, where noise is cut "
                 "off: its offset is too high and its read noise too small; raise the camera's "
@@ -290,7 +284,7 @@ def _spectrum(stack: FrameSource, masked: BoolArray, result: Solution) -> NoiseS
         offset_adu=result.offset.value,
         read_noise_e=result.read_e.value if result.read_e else 0.0,
     )
-    counts = stack.read(0, min(stack.shape[0], _SPECTRUM_FRAMES))
+    counts = stack.read(0, min(stack.shape[0], 128))  # on which correlations of pixels are measured
     return measure_spectrum(counts, camera, masked=masked)
 
 
@@ -366,7 +360,7 @@ def _curve(
     chi2 = float(
         (((curve["variance_adu2"] - curve["fit_adu2"]) / curve["variance_se"]) ** 2).mean()
     )
-    if chi2 > _MOST_CHI2_REDUCED:
+    if chi2 > 3.0:
         notes.append(
             f"the variance does not follow a straight line (reduced χ² {chi2:.3g}): the camera is "
             "not linear, the frames were processed, or the light itself is noisy"
@@ -462,7 +456,7 @@ def without_repeats(stack: FrameSource, least: int, notes: list[str]) -> FrameSo
         )
     lost = np.flatnonzero(~good)
     notes.append(
-        f"{stack.name}: frame{'s' if lost.size > 1 else ''} {listed(lost, _NAMED)} "
+        f"{stack.name}: frame{'s' if lost.size > 1 else ''} {listed(lost, 4)} "
         f"{'are' if lost.size > 1 else 'is'} zero throughout or the same as the frame before "
         "(dropped or stuck in the camera); left out"
     )

@@ -30,13 +30,7 @@ CEILING_REPEATS = 4
 """Counts that must share the largest one before it is taken for a converter's full scale."""
 
 _RATIO_TOLERANCE = 0.1  # of a mean of 1; a power that was not divided out is within it
-_RATIO_MOST_E = 10.0  # photoelectrons in a pixel, of which no interferometric image is made
 _OVERFLOW_JUMP = 0.75  # of the largest number, from one frame to the next
-_BRIGHT_QUANTILE = 0.99  # quantile of a frame, below which too few pixels lie for light to be on
-_FRAMES_TELL_BYTES = 8
-_LARGEST_OVERFLOW_SHARE = 1e-4  # of a frame's pixels that leap; more than blink
-_NEGATIVE_SIGMAS = 6.0  # 1e-9 of pixels in the dark
-_NEGATIVE_FRACTION = 0.01  # more pixels below the offset than a sensor has dead ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,7 +261,7 @@ def check_counts(
 
 def _refuse_negative(frame: NDArray[Any], floor: float | FloatArray, where: str) -> None:
     below = np.asarray(frame < floor)
-    if not (below & (frame < 0)).any() and below.mean() <= _NEGATIVE_FRACTION:
+    if not (below & (frame < 0)).any() and below.mean() <= 0.01:  # more than a sensor has dead ones
         return
     raise DataError(
         f"{where} lies below the camera's offset by more than its read noise {_first(below)} "
@@ -280,7 +274,7 @@ def _negative_floor_adu(camera: Camera, dtype: np.dtype[Any]) -> float | FloatAr
     """Lowest plausible count: offset less six standard deviations of read noise and rounding."""
     rounding = 1 / 12 if np.issubdtype(dtype, np.integer) else 0.0
     sigma = np.sqrt(np.square(np.divide(camera.read_noise_e, camera.gain_e_per_adu)) + rounding)
-    floor: float | FloatArray = camera.offset_adu - _NEGATIVE_SIGMAS * sigma
+    floor: float | FloatArray = camera.offset_adu - 6.0 * sigma  # 1e-9 of pixels in the dark
     return floor
 
 
@@ -293,7 +287,8 @@ def refuse_ratio(frame: NDArray[Any], where: str, camera: Camera) -> None:
         return
     mean, spread = float(frame.mean(dtype=np.float64)), float(frame.std(dtype=np.float64))
     gain = float(np.mean(camera.gain_e_per_adu))
-    ratio = abs(mean - 1) < _RATIO_TOLERANCE and spread < 1 / 2 and mean * gain < _RATIO_MOST_E
+    # no interferometric image has so few
+    ratio = abs(mean - 1) < _RATIO_TOLERANCE and spread < 1 / 2 and mean * gain < 10.0
     small = abs(mean) < _RATIO_TOLERANCE and 0 < spread < _RATIO_TOLERANCE
     contrast = small and spread * gain < 1 and frame.min() < 0
     if ratio or contrast:
@@ -314,7 +309,7 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
 
     Shapes: `counts` (t, y, x).
     """
-    if len(counts) > 1 and bytes_are_swapped(counts[:_FRAMES_TELL_BYTES]):
+    if len(counts) > 1 and bytes_are_swapped(counts[:8]):
         raise DataError(
             f"{name}: the bytes of its numbers are the other way round: pixels leap over the range "
             f"of {counts.dtype} from one frame to the next, and do not with the bytes of each "
@@ -328,7 +323,7 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
     for before, after in pairwise(counts):
         high = np.maximum(before, after)
         leap = (high - np.minimum(before, after) > _OVERFLOW_JUMP * largest) & (high < largest)
-        if _LARGEST_OVERFLOW_SHARE < leap.mean() < 1 / 2 and not _is_shutter(before, after):
+        if 1e-4 < leap.mean() < 1 / 2 and not _is_shutter(before, after):  # more than blink
             y, x = np.unravel_index(int(np.argmax(leap)), leap.shape)
             raise DataError(
                 f"{name}: counts have overflowed {8 * counts.dtype.itemsize} bits: pixels leap "
@@ -340,7 +335,7 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
 
 def _is_shutter(before: NDArray[Any], after: NDArray[Any]) -> bool:
     """Whether a shutter opens or closes: even the brightest pixels of one frame are dark."""
-    low, high = sorted(float(np.quantile(frame, _BRIGHT_QUANTILE)) for frame in (before, after))
+    low, high = sorted(float(np.quantile(frame, 0.99)) for frame in (before, after))
     return low < high / 2
 
 

@@ -34,14 +34,7 @@ ComplexArray = NDArray[np.complex128]
 REACH_PX = 4
 """From the edges of a field, within which a moved pattern is not to be trusted."""
 
-_STILL_PX = 16.0  # standard deviation of what is smoothed away of the pattern; speckle is finer
-_PASSES = 4
-_CLIP_SIGMAS = 4.0  # robust standard deviations beyond which a pixel does not count
 _SETTLED_PX = 1e-5
-_POOR_MISMATCH = 3.0  # mismatch over shot noise that asks for another start: the stage has jumped
-_LEAST_PATTERN_POWER = 1.0  # least squared gradient of the pattern over that of its noise
-_SPIKE_SIGMAS = 6.0  # robust standard deviations of a pixel from the median of those around it
-_LEAST_PEAK_RATIO = 8.0  # least peak of a phase correlation over the noise of one of random phases
 
 
 def middle_of(shape: tuple[int, ...], most_px: int) -> tuple[slice, slice]:
@@ -109,7 +102,7 @@ def follow_pattern(
         )  # fmt: skip
 
     found = list(mapper(one, range(1, lit.size)))
-    if not found or not np.median([clear for _, _, clear in found]) > _LEAST_PATTERN_POWER:
+    if not found or not np.median([clear for _, _, clear in found]) > 1.0:  # of that of its noise
         return None
     steps = np.array([step for step, _, _ in found])
     errors = np.array([error for _, error, _ in found])
@@ -133,7 +126,7 @@ def _register(
     nowhere = math.inf, np.zeros(2), np.full(2, math.inf), 0.0
 
     def refined(shift: FloatArray) -> tuple[float, FloatArray, FloatArray, float]:
-        for _ in range(_PASSES):
+        for _ in range(4):
             moved = pattern
             if shift.any():
                 image_there = mover.image(spectrum * mover.transfer(shift[None], np.ones(1)))
@@ -149,7 +142,7 @@ def _register(
                 image_read,
                 ratio,
                 deviation,
-                _CLIP_SIGMAS * scale,
+                4.0 * scale,  # a pixel beyond does not count
                 normal,
                 right,
             )
@@ -164,7 +157,7 @@ def _register(
         return scale, shift, scale * np.sqrt(np.diag(inverse)[:2]), clear
 
     found = refined(np.zeros(2))
-    if found[0] > _POOR_MISMATCH:
+    if found[0] > 3.0:  # the stage has jumped: another start
         far = np.array(measure_drift(pattern, np.where(usable, image, ratio * pattern)))
         if np.isfinite(far).all():
             found = min(found, refined(far), key=lambda result: result[0])
@@ -250,7 +243,7 @@ def still_light(blocks_e: NDArray[np.floating], usable: BoolArray) -> FloatArray
     Shapes: `blocks_e` (k, y, x), `usable` (y, x), result (y, x).
     """
     total = blocks_e.sum(axis=0, dtype=float)[filling(usable)]
-    smooth = gaussian_filter(total, _STILL_PX)
+    smooth = gaussian_filter(total, 16.0)  # speckle is finer
     least = 1e-3 * smooth.max()
     if not least > 0:
         return np.ones(usable.shape)
@@ -305,7 +298,7 @@ class Pattern:
             return math.nan, math.nan
         surface = fft.irfft2(cross / np.maximum(magnitude, 1e-12 * magnitude.max()), s=self.shape)
         at = np.unravel_index(int(np.argmax(surface)), surface.shape)
-        if surface[at] * math.sqrt(surface.size) < _LEAST_PEAK_RATIO:
+        if surface[at] * math.sqrt(surface.size) < 8.0:
             return math.nan, math.nan
         y, x = (int((i + n // 2) % n - n // 2) for i, n in zip(at, self.shape, strict=True))
         fy, fx = np.meshgrid(fft.fftfreq(self.shape[0]), fft.rfftfreq(self.shape[1]), indexing="ij")
@@ -322,4 +315,4 @@ def _without_spikes(image: FloatArray) -> FloatArray:
     """Replace outlying pixels by the median of their neighbours."""
     around = median_3x3(image)
     out = np.abs(image - around)
-    return np.where(out > _SPIKE_SIGMAS * 1.4826 * np.median(out), around, image)
+    return np.where(out > 6.0 * 1.4826 * np.median(out), around, image)

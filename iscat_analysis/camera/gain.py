@@ -30,9 +30,6 @@ from iscat_analysis.records import BoolArray, FloatArray
 
 _APART, _FAR = 8, 16  # frames: filters are forgotten by then
 _FEWEST, _FRAMES = 40, 256  # frames that tell, and as many as are asked
-_MOST_PIXELS = 4096  # that are asked, all over the field
-_LEAST_DEFICIT = 0.1  # by which the variance between neighbours falls short
-_MOST_GROWTH = 0.15  # of that, by which it may still grow farther on
 
 
 def shared_light(
@@ -46,7 +43,7 @@ def shared_light(
         return None
     counts, shape = counts[:_FRAMES], counts.shape[1:]
     places = np.arange(math.prod(shape)) if masked is None else np.flatnonzero(~masked)
-    places = places[:: max(1, -(-places.size // _MOST_PIXELS))]
+    places = places[:: max(1, -(-places.size // 4096))]
     offset, gain = (
         np.broadcast_to(value, shape).flat[places]
         for value in (camera.offset_adu, camera.gain_e_per_adu)
@@ -68,11 +65,7 @@ def shared_light(
     if apart <= 0 or far <= 0:
         return None
     short = 1 - near / apart
-    return (
-        near / apart
-        if short > _LEAST_DEFICIT and abs(far / apart - 1) < _MOST_GROWTH * short
-        else None
-    )
+    return near / apart if short > 0.1 and abs(far / apart - 1) < 0.15 * short else None
 
 
 def averaged_noise(counts: NDArray[Any], camera: Camera) -> float | None:
@@ -91,10 +84,6 @@ def averaged_noise(counts: NDArray[Any], camera: Camera) -> float | None:
     squares = [float(np.mean((pixels[k:] - pixels[:-k]) ** 2)) for k in (*range(1, _APART), _FAR)]
     common = sum(1 - one / squares[-1] for one in squares[:-1])
     return squares[-1] / squares[0] * (1 + 2 * common)
-
-
-MOST_EXPLAINED = 0.5
-"""Share of the noise beyond the light's that the motion of the pattern must explain to be named."""
 
 
 @dataclass(frozen=True)
@@ -184,12 +173,6 @@ class _Pattern:
         return np.asarray(np.linalg.solve(self.information, seen.T).T)
 
 
-_GAIN_TOLERANCE = 0.10  # of the noise variance, before the user is told
-_GAIN_SIGMAS = 3.0  # and the excess over the tolerance that chance must not explain
-_OUTLIER_SIGMAS = 8.0  # a blinking pixel, in standard deviations of one pixel's variance
-_OUTLIER_FRAMES = 16  # fewer, and the variance of one pixel is too uncertain to call it an outlier
-
-
 @dataclass(frozen=True)
 class GainDiagnosis:
     """Measured noise over that of the configured gain."""
@@ -207,7 +190,7 @@ class GainDiagnosis:
     @property
     def off(self) -> bool:
         """Whether the gain is wrong by more than 10 %, and chance does not explain it."""
-        return abs(self.noise_ratio - 1) > _GAIN_TOLERANCE + _GAIN_SIGMAS * self.noise_ratio_se
+        return abs(self.noise_ratio - 1) > 0.10 + 3.0 * self.noise_ratio_se
 
     @property
     def shakes(self) -> bool:
@@ -215,7 +198,7 @@ class GainDiagnosis:
         return (
             self.off
             and self.pattern_jitter is not None
-            and self.pattern_jitter.share > MOST_EXPLAINED
+            and self.pattern_jitter.share > 0.5  # of the excess, which its motion makes
         )
 
     @property
@@ -342,11 +325,11 @@ def with_pattern_jitter(
 
 def _without_outliers(ratios: FloatArray, n_frames: int) -> BoolArray:
     """Leave out blinking pixels, whose variance would outweigh that of all others."""
-    if n_frames < _OUTLIER_FRAMES:
+    if n_frames < 16:  # too few to call a pixel an outlier
         return np.ones(ratios.shape, dtype=np.bool_)
     # Relative spread of half the mean squared successive difference of normal numbers
     # (von Neumann et al., Ann. Math. Stat. 12, 153, 1941).
     spread = math.sqrt(3 * n_frames - 4) / (n_frames - 1)
     centre = float(np.median(ratios))
-    kept: BoolArray = ratios <= centre * (1 + _OUTLIER_SIGMAS * spread)
+    kept: BoolArray = ratios <= centre * (1 + 8.0 * spread)  # a blinking pixel is beyond
     return kept if centre > 0 else np.ones(ratios.shape, dtype=np.bool_)

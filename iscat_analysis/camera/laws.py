@@ -65,13 +65,8 @@ BENT: tuple[Kind, ...] = ("gamma", "saturation")
 """Laws by which counts are no line in light, so that masses are wrong whatever the numbers."""
 
 
-# Of χ², by which a law with one number more must describe the pixels better
-_LEAST_CHI2_GAIN = 16.0
-_LEAST_CHI2_GAIN_OFFSET = 20.0  # the same, where an offset is wrong besides
-_MOST_CHI2_LOSS = 6.0  # of χ², within which another law is as good
 _RARE = {"noisy light": 6.0, "other light": 2.0}  # of χ², by which these must be better still
 _STEP, _SETTLED, _STUCK = 1e-6, 1e-4, 1e6  # of numbers of laws, of χ², and damping
-_MOST_FILLED = 0.98  # of full scale, up to which the light follows from the counts
 
 
 @dataclass(frozen=True)
@@ -132,7 +127,7 @@ class _Family:
 
 def _filled(u: FloatArray, x: float) -> FloatArray:
     """Photoelectrons over those at full scale, of counts u over the mean; x at the mean."""
-    return -np.log1p(-np.minimum(-math.expm1(-x) * u, _MOST_FILLED))
+    return -np.log1p(-np.minimum(-math.expm1(-x) * u, 0.98))  # of full scale
 
 
 def _saturation(u: FloatArray, x: float) -> Curves:
@@ -177,14 +172,14 @@ def find_law(found: Transfer, *, most_read: float = 0.0, least_offset: float = -
         if found.flicker is not None and family.kind in BENT
     ]
     both = min(pairs, key=lambda law: law.chi2, default=best)
-    if best.chi2 - both.chi2 > _LEAST_CHI2_GAIN_OFFSET:
+    if best.chi2 - both.chi2 > 20.0:
         return both
-    if linear - best.chi2 < _LEAST_CHI2_GAIN:
+    if linear - best.chi2 < 16.0:  # a line is as good
         zero = next(law for law in laws if law.kind == "offset")
         se = math.hypot(zero.value, zero.se)  # of zero, which is kept
         flickers = found.flicker is not None
         return Law("linear", 0.0, se, 1.0, se, chi2=linear, flickers=flickers)
-    return _among(best, [law for law in laws if law.chi2 - best.chi2 < _MOST_CHI2_LOSS])
+    return _among(best, [law for law in laws if law.chi2 - best.chi2 < 6.0])
 
 
 def _among(best: Law, alike: list[Law]) -> Law:
@@ -272,7 +267,6 @@ def _least_squares(
 COLUMNS = ("counts", "photoelectrons")
 """Of a response curve."""
 
-_POINTS = 1025
 _HIGHEST = 0.98  # of the counts at which a camera saturates, up to which the curve goes
 
 
@@ -414,5 +408,5 @@ def response_of(law: Law, found: Transfer, camera: Camera, top: float) -> Respon
         n = light(np.minimum(mean, _HIGHEST * full))
         contrast = n / np.expm1(n)
     scale = float(np.average(np.square(contrast * mean) / variance / light(mean), weights=weight))
-    counts = np.linspace(zero, end, _POINTS)
+    counts = np.linspace(zero, end, 1025)
     return Response(counts, scale * light(counts - zero))

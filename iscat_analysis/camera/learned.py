@@ -55,13 +55,10 @@ from iscat_analysis.units import count
 
 _MOST_FRAMES, _MOST_COUNTS = 1024, 2**23  # that are looked at: it takes a second
 _LEAST_FRAMES = 8
-_LEVEL_FRAMES = 24  # frames all over a movie, that tell how much light there is
 _FIRST_FRAMES = 64  # frames among which some may be dark
 _DARK_LIGHT_SHARE = 0.5  # of the usual counts, below which a frame may be without light
-_DARK_SPREAD_SHARE = 0.01  # of the usual counts, by which dark frames may differ
 # of what the counts of dark frames would show, if they were light: its error, and itself
 _LIT_SHARE_ERROR, _LIT_SHARE = 0.1, 0.1
-_DARK_NOISE_SHARE = 0.5  # of the noise that its counts would have if they were light
 
 
 def sample(
@@ -72,7 +69,7 @@ def sample(
     Shapes: `lit` (t, y, x), `dark` (k, y, x).
     """
     total = movie.shape[0]
-    looks = np.unique(np.linspace(span[0], span[1] - 1, _LEVEL_FRAMES).astype(int)).tolist()
+    looks = np.unique(np.linspace(span[0], span[1] - 1, 24).astype(int)).tolist()
     levels = [float(frame.mean()) for k in looks for frame in _finite(movie.read(k, k + 1))]
     first = min(_FIRST_FRAMES, total)
     looked = [(k, float(one.mean())) for k in range(first) for one in _finite(movie.read(k, k + 1))]
@@ -81,7 +78,7 @@ def sample(
     usual = float(np.quantile(levels, 0.75))
     means = np.array([mean for _, mean in looked])
     dim = (means < _DARK_LIGHT_SHARE * usual) & (means > 0)
-    dim &= means - means.min() < _DARK_SPREAD_SHARE * usual  # and no shutter that is opening
+    dim &= means - means.min() < 0.01 * usual  # and no shutter that is opening
     most = max(_LEAST_FRAMES, min(_MOST_FRAMES, _MOST_COUNTS // pixels))
     counts = _finite(movie.read(span[0], min(span[1], span[0] + most)))
     lit = counts.mean(axis=(1, 2)) > _DARK_LIGHT_SHARE * usual
@@ -118,7 +115,7 @@ def _is_dark(dark: NDArray[Any], lit: NDArray[Any]) -> bool:
     if error < _LIT_SHARE_ERROR * as_light:
         return abs(share) < _LIT_SHARE * as_light + 3 * error
     noise = noise_adu2(dark) if len(dark) > 1 else noise_adu2(np.moveaxis(dark, 2, 0))
-    return noise < _DARK_NOISE_SHARE * as_light * noise_adu2(lit)
+    return noise < 0.5 * as_light * noise_adu2(lit)
 
 
 def noise_adu2(counts: NDArray[Any]) -> float:
@@ -134,15 +131,9 @@ EFFECTIVE, ASSUMPTION, ROUNDING = "effective", "assumed", "rounding"
 
 _GAIN_FRAMES = 128  # on which the gain is measured, to some parts in a thousand
 _FIRST_FRAMES = 64  # frames that motion of the pattern is taken from
-_LARGEST_NOISE_RATIO = 4.0  # times the median, of the noise of a pixel in the dark that is left out
 _READ_E, _READ_STEPS = 30.0, 3.0  # read noise that a camera may have without anybody saying so [e]
-_ROUNDED = 1e-3  # of the light's variance, from where rounding is not left out
-_FINE = 1e4  # times the variance of rounding, from where that has no part in the gain
-_COARSE = 0.16  # of a squared step: less noise is lost in rounding
-_LEAST_JITTER_SHARE = 0.03  # of the noise, from where motion of the pattern is taken off before
 _TURNS = 3
 _WORD = 16  # bits of most files
-_RESOLVED_PIXEL = 0.4  # of λ/NA, below which pixels are finer than any detail of light
 _FOURTH = 70.0  # sum of the squares of 1, −4, 6, −4, 1: the norm of both axes together
 
 
@@ -221,7 +212,7 @@ def with_camera(
     text = find_text(movie, span)
     movie = linear(movie, config.camera)
     optics, pixel_nm = config.optics, config.camera.pixel_size_nm or math.inf
-    resolved = pixel_nm < _RESOLVED_PIXEL * optics.wavelength_nm / optics.na
+    resolved = pixel_nm < 0.4 * optics.wavelength_nm / optics.na  # finer than any detail of light
     learned = learn_camera(
         movie if text is None else patched(movie, text),
         config.camera,
@@ -327,7 +318,7 @@ class _Learning:
             self._set("offset_adu", float(np.mean(pixels)), error, DARK)
         if "read_noise_e" in self.free and len(dark) > 1:
             variance = np.mean(np.diff(dark.astype(np.float64), axis=0) ** 2, axis=0) / 2
-            usual = variance < _LARGEST_NOISE_RATIO * np.median(variance)
+            usual = variance < 4.0 * np.median(variance)
             self._dark_variance = float(variance[usual].mean()) if usual.any() else None
 
     def learn(self) -> None:
@@ -357,7 +348,8 @@ class _Learning:
     def _learn_gain(self) -> bool:
         """Measure the gain; False where it cannot be."""
         quiet = self._dark_variance is None and not np.any(self.camera.read_noise_e)
-        fine = noise_adu2(self.counts) > _FINE * rounding_variance_adu2(self.counts)
+        # rounding has no part in the gain
+        fine = noise_adu2(self.counts) > 1e4 * rounding_variance_adu2(self.counts)
         for _ in range(1 if quiet and fine else _TURNS):  # what is no light depends on the gain
             if self._dark_variance is not None:
                 gain = float(np.mean(self.camera.gain_e_per_adu))
@@ -377,7 +369,7 @@ class _Learning:
         """Measure the gain by the noise between neighbouring frames, or by that of averages."""
         camera, counts = self.camera, self.counts[:_GAIN_FRAMES]
         step2 = 12 * rounding_variance_adu2(counts)
-        if step2 and 0 < noise_adu2(counts) < _COARSE * step2:
+        if step2 and 0 < noise_adu2(counts) < 0.16 * step2:  # less is lost in rounding
             as_stored = counts.astype(np.float64)  # of which nothing is taken off for rounding
             found = diagnose_gain(as_stored, replace(camera, read_noise_e=0.0))
             return found.gain_e_per_adu, found.gain_se, EFFECTIVE
@@ -394,7 +386,7 @@ class _Learning:
         )
         if calm is not None and rough is not None:
             ratio = calm.noise_ratio / rough.noise_ratio
-            if ratio < 1 - _LEAST_JITTER_SHARE - 3 * calm.noise_ratio_se:
+            if ratio < 1 - 0.03 - 3 * calm.noise_ratio_se:
                 return found.gain_e_per_adu / ratio, found.gain_se / ratio, MEASURED
         spectrum = measure_spectrum(counts, seen)
         if spectrum is not None and spectrum.correlated:
@@ -504,7 +496,7 @@ class _Learning:
         rounding = rounding_variance_adu2(self.counts) * gain**2 - 1 / 12
         light = float(np.median(self.camera.to_electrons(self.counts.mean(axis=0))))
         read = float(np.mean(np.square(self.camera.read_noise_e)))
-        if self._source["gain_e_per_adu"] != EFFECTIVE and rounding > max(read, _ROUNDED * light):
+        if self._source["gain_e_per_adu"] != EFFECTIVE and rounding > max(read, 1e-3 * light):
             self._set("read_noise_e", math.sqrt(rounding), 0.0, ROUNDING)
 
 
@@ -544,12 +536,6 @@ def _short(counts: NDArray[Any], camera: Camera) -> GainDiagnosis | None:
         return None
 
 
-_DISAGREEMENT = 0.01  # relative, between configuration and metadata
-
-
-_OPTICS_DISAGREEMENT = 0.05  # the aperture that was measured is some percent below the engraved one
-
-
 def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, list[Finding]]:
     """Set what the configuration leaves open from the metadata of the movie."""
     notes = []
@@ -568,7 +554,7 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, l
             if key == "pixel_size_nm":
                 _refuse_unlikely(read, metadata.source)
             found[key] = read
-        elif abs(read / given - 1) > _DISAGREEMENT:
+        elif abs(read / given - 1) > 0.01:
             values: dict[str, float | str] = {"words": words, "given": given, "read": read}
             notes.append(
                 METADATA_DISAGREES({**values, **source, "unit": unit, "key": f"camera.{key}"})
@@ -606,7 +592,7 @@ def _with_optics(optics: Optics, metadata: StackMetadata) -> tuple[Optics, list[
         if given == type(optics).model_fields[key].default:
             found[key] = read
             notes.append(OPTICS_OF_FILE(values))
-        elif abs(read / given - 1) > _OPTICS_DISAGREEMENT:
+        elif abs(read / given - 1) > 0.05:  # measured, it is some percent below the engraved one
             notes.append(METADATA_DISAGREES(values))
     if not found:
         return optics, notes

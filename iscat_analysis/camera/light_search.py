@@ -34,7 +34,6 @@ from iscat_analysis.camera.light import Fringes, LightModel, Seams, Smooth, lift
 from iscat_analysis.medians import robust_sigma
 from iscat_analysis.records import BoolArray, FloatArray
 
-_LEAST_CONTRAST_SHARE = 0.02  # of a pixel's variance between two windows, below which no change is
 HIGHEST_DEGREE = 12
 """Of a polynomial that is divided out: over a field of 128 pixels it follows waves of 40."""
 
@@ -43,7 +42,6 @@ _CELLS = 20  # along each axis of the grid on which changes are looked for
 _CLIP_SIGMAS = 4.0  # robust standard deviations beyond which a cell shows something else
 _FEWEST_LINES = 8  # of a part between seams
 _SEAM_DEGREE, _WAVE_DEGREE = 6, 8  # of the smooth light over which seams and waves must stand out
-_NORMAL_SQUARE = 0.4549364231195724  # median of the square of a normal variable
 _PARTS = 8  # along each axis, whose added light is compared
 
 
@@ -91,7 +89,7 @@ class Changes:
 
     def least(self, window: int) -> float:
         """Mean square contrast of two windows below which a change is ignored."""
-        return _LEAST_CONTRAST_SHARE * float(2 / (window * self.light_e[self.used].mean()))
+        return 0.02 * float(2 / (window * self.light_e[self.used].mean()))  # of a pixel's variance
 
     def without(self, model: LightModel) -> Changes:
         """Divide the sums by the changes of a model, as each of them shows it."""
@@ -215,7 +213,8 @@ def _steps_along(
         size = np.where(far, np.linalg.norm(independent, axis=0), np.inf)
         gains = np.square(rest @ (independent / size))
         best = int(gains.sum(axis=0).argmax())
-        if np.median(gains[:, best]) / _NORMAL_SQUARE - 1 < max(by_chance, least):
+        # median of the square of a normal variable
+        if np.median(gains[:, best]) / 0.4549364231195724 - 1 < max(by_chance, least):
             break
         tried.append(best)
     return tuple(sorted(int(lit[k]) for k in tried[:kept]))

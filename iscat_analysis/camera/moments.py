@@ -20,8 +20,6 @@ from iscat_analysis.camera.counts import converter_ceiling
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource
 
-_BLOCK_BYTES = 4 * 2**20  # in doubles: what lies in a processor's cache takes no fresh memory
-_BINS = 32
 _MAD_PER_SIGMA = 0.6744898
 _TOGETHER = {"frames": (1, 2), "rows": (2,), "columns": (1,)}  # axes of (t, y, x)
 
@@ -47,7 +45,8 @@ class Moments:
 def blocks(stack: FrameSource) -> Iterator[tuple[int, int]]:
     """Divide a stack into ranges of frames that fit into memory."""
     frames, rows, columns = stack.shape
-    size = max(2, _BLOCK_BYTES // (8 * rows * columns))
+    # in doubles: what lies in a processor's cache takes no fresh memory
+    size = max(2, (4 * 2**20) // (8 * rows * columns))
     for start in range(0, frames, size):
         yield start, min(start + size, frames)
 
@@ -62,7 +61,7 @@ def brightness_bins(mean: FloatArray) -> list[NDArray[np.intp]]:
 
     Shapes: `mean` (n,).
     """
-    return np.array_split(np.argsort(mean), max(1, min(_BINS, mean.size // 32)))
+    return np.array_split(np.argsort(mean), max(1, min(32, mean.size // 32)))
 
 
 def moments_of(

@@ -37,13 +37,8 @@ from iscat_analysis.units import count, listed
 
 _FRAMES, _TOGETHER, _COUNTS = 128, 8, 2**24  # that are looked at, in groups all over the movie
 _FEWEST = 16
-_RANGE = 2.5  # times the range of the counts of most pixels, which ink exceeds
 _AGAIN = 0.02  # of the frames that have the same count, at least and at most
-_TIMES = 3  # and as many frames
-_APART = 5.0  # standard deviations of the light, between which and the ink there is nothing
 _LEAST_PIXELS = 8  # of a text
-_GAP = 4  # pixels between letters, at most
-_MOST = 0.25  # of the field
 _MARGIN = 1  # pixel around a text, for letters that are smooth
 
 
@@ -129,7 +124,7 @@ def find_text(movie: Stack, span: tuple[int, int]) -> BoolArray | None:
         return None
     lowest, highest = counts.min(axis=0).astype(np.int64), counts.max(axis=0).astype(np.int64)
     width = highest - lowest
-    doubtful = width > _RANGE * max(float(np.median(width)), 1.0)
+    doubtful = width > 2.5 * max(float(np.median(width)), 1.0)  # as ink does
     if not doubtful.sum() >= _LEAST_PIXELS:
         return None
     series = np.sort(counts[:, doubtful].astype(np.int64), axis=0)
@@ -137,8 +132,8 @@ def find_text(movie: Stack, span: tuple[int, int]) -> BoolArray | None:
     light = np.where(series == ink, np.nan, series)
     light[:, share == 1] = 0.0  # nothing but ink, or dead
     scatter = 1.4826 * np.nanmedian(np.abs(light - np.nanmedian(light, axis=0)), axis=0)
-    apart = np.nanmin(np.abs(light - ink), axis=0) > _APART * np.maximum(scatter, 1.0)
-    inked = apart & (share >= max(_AGAIN, _TIMES / len(counts))) & (share <= 1 - _AGAIN)
+    apart = np.nanmin(np.abs(light - ink), axis=0) > 5.0 * np.maximum(scatter, 1.0)
+    inked = apart & (share >= max(_AGAIN, 3 / len(counts))) & (share <= 1 - _AGAIN)
     letters = np.zeros(doubtful.shape, dtype=np.bool_)
     letters[doubtful] = inked
     inks = np.unique(ink[inked])
@@ -147,7 +142,8 @@ def find_text(movie: Stack, span: tuple[int, int]) -> BoolArray | None:
     # some letters stay, and others change in a few frames
     letters |= (doubtful | (width == 0)) & np.isin(counts, inks).any(axis=0)
     text = np.zeros_like(letters)
-    for box in find_objects(label(binary_dilation(letters, iterations=_GAP))[0]):
+    # pixels between letters
+    for box in find_objects(label(binary_dilation(letters, iterations=4))[0]):
         y, x = np.nonzero(letters[box])
         if y.size >= _LEAST_PIXELS:
             top, left = box[0].start + int(y.min()), box[1].start + int(x.min())
@@ -156,7 +152,7 @@ def find_text(movie: Stack, span: tuple[int, int]) -> BoolArray | None:
                 max(top - _MARGIN, 0) : bottom + _MARGIN + 1,
                 max(left - _MARGIN, 0) : right + _MARGIN + 1,
             ] = True
-    return text if 0 < text.mean() < _MOST else None
+    return text if 0 < text.mean() < 0.25 else None  # of the field
 
 
 def _sample(movie: Stack, span: tuple[int, int]) -> NDArray[Any]:
@@ -187,17 +183,9 @@ def _commonest(series: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np
     return series[last, columns], length[last, columns] / frames
 
 
-_CHANCE = 1e-9  # that noise alone makes a pixel unsteady
 _AROUND = 5  # pixels along each side, whose median tells how counts scatter there
-# Times shot noise, by which most pixels change slowly where it is not the pixels
-_SLOW_CHANGE_RATIO = 3.0
-_LEAST_LINE_EXCESS = 0.15  # of the usual scatter, by which that of a noisy line is larger at least
-_LINE_SIGMAS = 8.0  # robust standard deviations of all lines
 _SIGMA_PER_MAD = 1.4826  # standard deviation of a normal law over its median deviation
-_FEWEST_FRAMES = 20  # frames that tell
-_LEAST_E = 20.0  # of light, below which noise is far from normal
 _LINE_SHARE = 0.5  # of the pixels of a line that is named as such
-_MOST_PIXEL_SHARE = 0.1  # of the pixels: where more are, it is not the pixels that are odd
 
 
 def unsteady_finding(pixels: BoolArray, name: str) -> Finding:
@@ -228,7 +216,7 @@ def find_unsteady(
     """
     frames = np.array([len(block) for block in blocks])
     freedom = int((frames - 1).sum()), len(blocks) - 1
-    if freedom[0] < _FEWEST_FRAMES or freedom[1] < 4:
+    if freedom[0] < 20 or freedom[1] < 4:
         return None
     shape = blocks[0].shape[1:]
     summed = np.zeros(shape)
@@ -236,7 +224,7 @@ def find_unsteady(
     for block in blocks:
         block_extremes(block, summed, highest, still)
     light = camera.to_electrons(summed / frames.sum())
-    lit = light > max(_LEAST_E, 0.1 * float(np.median(light)))
+    lit = light > max(20.0, 0.1 * float(np.median(light)))  # below it noise is far from normal
     lit &= ~camera.saturated(highest)
     level = float(light[lit].mean()) if lit.any() else 0.0
     if lit.mean() < 0.5:
@@ -258,11 +246,9 @@ def find_unsteady(
     for scatter, number in ((fast, freedom[0]), (slow, freedom[1])):
         ratio = np.where(lit, scatter.squares / variance / number, 0.0)
         usual = float(np.median(ratio[lit]))
-        if (
-            scatter is slow and usual > _SLOW_CHANGE_RATIO
-        ):  # by the light or the stage, and in what pattern
+        if scatter is slow and usual > 3.0:  # by the light or the stage, and in what pattern
             continue
-        limit = chdtri(number, _CHANCE) / number
+        limit = chdtri(number, 1e-9) / number
         more = ratio > usual * limit
         more &= scatter.neighbour_products < least_beside * scatter.squares
         more &= _largest_neighbour(ratio) - usual < least_beside * (ratio - usual)
@@ -272,7 +258,7 @@ def find_unsteady(
         if scatter is fast:
             found |= _noisy_lines(ratio, lit, usual, least_beside)
     found &= lit
-    return found if 0 < found.mean() < _MOST_PIXEL_SHARE else None
+    return found if 0 < found.mean() < 0.1 else None  # more, and the pixels are not odd
 
 
 def _largest_neighbour(values: FloatArray) -> FloatArray:
@@ -313,7 +299,7 @@ def _noisy_lines(ratio: FloatArray, lit: BoolArray, usual: float, least_beside: 
         spread = _SIGMA_PER_MAD * float(np.median(np.abs(excess - np.median(excess))))
         padded = np.pad(excess, 1, mode="reflect")
         neighbours = np.maximum(padded[:-2], padded[2:])
-        off = excess > max(_LEAST_LINE_EXCESS * usual, _LINE_SIGMAS * spread)
+        off = excess > max(0.15 * usual, 8.0 * spread)
         odd = lines[off & (neighbours < least_beside * excess)]
         noisy[(slice(None), odd) if axis == 0 else odd] = True
     return noisy

@@ -23,18 +23,8 @@ from iscat_analysis.findings.camera import FRAMES_PROCESSED
 from iscat_analysis.medians import robust_sigma
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource
 
-_PAIRS = 48  # of neighbouring frames, all over the movie
-_FEWEST_PAIRS = 8  # of them that tell
-_SIDE_PX = 512  # of the middle of the field, that is looked at
-_LEAST_E = 20.0  # photoelectrons of a pixel, below which noise is far from normal
-_FINEST = 0.5  # cycles per pixel, beyond which only noise is: the corners of the spectrum
 _COARSE = (0.1, 0.3)  # cycles per pixel that they are compared with
-_STILL_QUANTILE = 0.9  # quantile of their ratio, of pairs of frames between which little vibrates
-_OUTLIER_SIGMAS = 5.0  # robust standard deviations beyond which a pixel's change is no noise
-_LEAST_SIGMAS = 6.0  # standard errors
-_LEAST_NOISE_CHANGE = 0.1  # of the finest noise, by which it must change from frame to frame
 _WEAK, _STRONG = 0.5, 2.0  # finest noise over that at coarser patterns
-_MEDIAN_ERROR = 2.33  # √n times the relative error of a variance by the median deviation of n
 
 Kind = Literal["interpolated", "smoothed", "sharpened"]
 
@@ -89,15 +79,15 @@ def find_processing(
 
     Where particles move, coarser patterns are of them, and do not tell what was smoothed.
     """
-    rows, columns = middle_of(movie.shape, _SIDE_PX)
+    rows, columns = middle_of(movie.shape, 512)
     fine, coarse = _bands(rows.stop - rows.start, columns.stop - columns.start)
     found = []
-    starts = np.unique(np.linspace(span[0], span[1] - 2, _PAIRS).astype(int))
+    starts = np.unique(np.linspace(span[0], span[1] - 2, 48).astype(int))
     for start in starts.tolist() if span[1] - span[0] > 1 else ():
         spectrum = _spectrum(movie, camera, start, (rows, columns))
         if spectrum is not None:
             found.append((spectrum[fine].mean(), spectrum[coarse].mean()))
-    if len(found) < _FEWEST_PAIRS:
+    if len(found) < 8:
         return None
     finest, coarser = np.array(found).T
     # |z|² of a complex normal number scatters by its mean; a normalised movie's noise changes at
@@ -106,8 +96,8 @@ def find_processing(
     uneven = min(
         _uneven(finest, 1 / sizes[0]), _uneven(finest / coarser, 1 / sizes[0] + 1 / sizes[1])
     )
-    ratio = float(np.quantile(finest / coarser, _STILL_QUANTILE))
-    if uneven > _LEAST_NOISE_CHANGE:
+    ratio = float(np.quantile(finest / coarser, 0.9))  # of pairs between which little vibrates
+    if uneven > 0.1:  # of itself
         return Processing("interpolated", ratio, uneven)
     if moving:
         return None
@@ -124,7 +114,7 @@ def _uneven(values: FloatArray, chance: float) -> float:
     middle = float(np.median(values))
     scatter = robust_sigma(values - middle) / middle
     excess = scatter**2 - chance
-    significant = excess > _LEAST_SIGMAS * chance * _MEDIAN_ERROR / math.sqrt(len(values))
+    significant = excess > 6.0 * chance * 2.33 / math.sqrt(len(values))
     return math.sqrt(excess) if significant else 0.0
 
 
@@ -136,7 +126,7 @@ def _bands(rows: int, columns: int) -> tuple[BoolArray, BoolArray]:
     y, x = fft.fftfreq(rows)[:, None], fft.rfftfreq(columns)[None, :]
     radius = np.hypot(y, x)
     own = (y != 0) & (x > 0) & (x < 0.5)
-    return own & (radius > _FINEST), own & (radius > _COARSE[0]) & (radius < _COARSE[1])
+    return own & (radius > 0.5), own & (radius > _COARSE[0]) & (radius < _COARSE[1])
 
 
 def _spectrum(
@@ -148,7 +138,7 @@ def _spectrum(
         return None
     before, after = camera.to_electrons(counts)[(slice(None), *region)]
     powers = float(before.mean()), float(after.mean())
-    if min(powers) < _LEAST_E:
+    if min(powers) < 20.0:  # noise is far from normal
         return None
     before, after = before / powers[0], after / powers[1]
     light = before + after
@@ -156,6 +146,6 @@ def _spectrum(
     change = np.where(used, (after - before) / np.sqrt(np.where(used, light, 1.0)), 0.0)
     # shot noise over the light: alike in all frames, whatever the laser does
     change *= math.sqrt(2 / (1 / powers[0] + 1 / powers[1]))
-    limit = _OUTLIER_SIGMAS * robust_sigma(change[used])
+    limit = 5.0 * robust_sigma(change[used])
     waves = fft.rfft2(np.clip(change, -limit, limit))
     return np.asarray(np.square(waves.real) + np.square(waves.imag))

@@ -99,16 +99,9 @@ class CameraCalibration:
 LEAST_RELIABILITY = 0.9
 """Of the spread of the means of pixels, what must not be their own noise."""
 
-_Z95_ONE_SIDED = 1.644854
-_SIGMAS = 3.0
-_USABLE_SLOPE = 0.30  # relative standard error beyond which a gain is none
 _GOOD_SLOPE = 0.05
-_USABLE_OFFSET = 0.05  # standard error over the light level
-_MOST_FLICKER_CHI2 = 2.0  # robust χ² of the flicker line beyond which the scene has moved
 # Of half of the pixels, standard errors from which read noise is not chance
 _READ_NOISE_SIGMAS = 3.5
-_LEAST_HALF = 32  # pixels
-_TILE_PX = 8  # side of the tiles that the halves are made of; noise is correlated less far
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +139,9 @@ def solve(
     line = None
     if reliability > LEAST_RELIABILITY:
         (intercept, slope), cov = variance_line(mean, variance, frames)
-        if slope > 0 and math.sqrt(cov[1, 1]) / slope < _USABLE_SLOPE:
+        if slope > 0 and math.sqrt(cov[1, 1]) / slope < 0.30:
             line = intercept, slope, cov
-        elif slope <= 0 and -slope > _SIGMAS * math.sqrt(cov[1, 1]):
+        elif slope <= 0 and -slope > 3.0 * math.sqrt(cov[1, 1]):
             raise DataError(
                 "the noise falls as the light rises: the frames were processed, or are saturated; "
                 "give raw counts"
@@ -181,7 +174,7 @@ def solve(
         narrower = read.adu2.se / (slope**2 * read.e2.se)
         adu = Estimate(electrons.value * slope, electrons.se * slope * narrower)
         return Solution(gain, offset, source, adu, electrons, None, intercept, slope)
-    below = math.sqrt(max(read.e2.value, 0.0) + _Z95_ONE_SIDED * read.e2.se)
+    below = math.sqrt(max(read.e2.value, 0.0) + 1.644854 * read.e2.se)
     notes.append(
         f"the read noise is too small beside the shot noise to be seen: below {below:.3g} e "
         "(95 %); a dark would measure it"
@@ -221,9 +214,9 @@ def _read_variance(line: tuple[float, float, FloatArray], offset: Estimate) -> _
 
 def _half(found: Sequence[Moments], used: BoolArray, given: float | None) -> Estimate | None:
     """Read noise of every other tile of the sensor [counts²]."""
-    y, x = np.indices(used.shape) // _TILE_PX
+    y, x = np.indices(used.shape) // 8  # noise is correlated less far
     part = used & ((y + x) % 2 == 0)
-    if np.count_nonzero(part) < _LEAST_HALF:
+    if np.count_nonzero(part) < 32:
         return None
     offset, _ = _offset(found, part, given, [])
     if offset is None:
@@ -402,7 +395,7 @@ def _offset(
     value = float(np.sum(weights * [item.value for item in known]) / weights.sum())
     se = float(1 / math.sqrt(weights.sum()))
     level = float(np.mean([item.mean[used].mean() for item in found]))
-    if se > _USABLE_OFFSET * abs(level - value):
+    if se > 0.05 * abs(level - value):  # of the light level
         return None, "line"
     notes.append(
         "the offset is that of the light which follows the laser's power: stray light that "
@@ -441,7 +434,7 @@ def zero_of_flicker(
         residual = (slope - level - gradient * x) * np.sqrt(weight)
         robust = robust_sigma(residual)
         kept = np.abs(residual) < 5 * max(robust, 1e-12)
-    if robust**2 > _MOST_FLICKER_CHI2 or gradient <= 0:
+    if robust**2 > 2.0 or gradient <= 0:  # the scene has moved
         return None
     rest = w * (slope - level - gradient * x)
     by_level, by_gradient = _together(np.stack([rest, rest * x], axis=1), tiles).T

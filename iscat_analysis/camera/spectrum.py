@@ -28,12 +28,6 @@ REACH_PX = 6
 MARGIN_PX = REACH_PX + 2
 """Width over which images are continued by reflection before they are whitened."""
 
-_PAIRS = 64  # of frames that are compared
-_LIGHT_E = 20.0  # mean photoelectrons of a pixel and frame below which noise is far from normal
-_OUTLIER_SIGMAS = 5.0  # robust standard deviations beyond which a pixel's change is no noise
-_MOST_MORE_OUTLIERS = 4  # such pixels more than in most pairs of frames, where something has landed
-_FIRST_PAIRS = 9  # their median number of such pixels is that of a pair in which nothing lands
-_EVERY_NTH_PIXEL = 8  # of as many pixels, whose median tells how large the noise is
 LEAST_SIGMAS = 4.5  # standard errors beyond which a correlation is one
 _LEAST_CORRECTION = 0.01  # of the expected variance, below which nothing is corrected
 _LEAST_VARIANCE = 0.05  # of the variance, that every frequency is taken to have
@@ -148,7 +142,7 @@ def measure_spectrum(
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """
     rows, columns = counts.shape[1:]
-    pairs = min(len(counts) // 2, _PAIRS)
+    pairs = min(len(counts) // 2, 64)
     if pairs < 4 or min(rows, columns) < 4 * REACH_PX:
         return None
     starts = 2 * np.linspace(0, len(counts) // 2 - 1, pairs).astype(int)
@@ -162,7 +156,7 @@ def measure_spectrum(
     if used.mean() < 0.5:
         return None
     light = float(mean[used].mean())
-    if light < _LIGHT_E:
+    if light < 20.0:  # noise is far from normal
         return None
 
     # rounded to single precision, which is a millionth of the noise and takes half of the time
@@ -183,15 +177,15 @@ def measure_spectrum(
         z = after / powers[1] - before / powers[0]
         z /= np.sqrt(by_light * expected + by_frame * read_noise)
         z[~used] = 0.0
-        middle = float(np.median(np.abs(z[used][::_EVERY_NTH_PIXEL])))
-        return z, _OUTLIER_SIGMAS * SIGMA_PER_MAD * middle
+        middle = float(np.median(np.abs(z[used][::8])))
+        return z, 5.0 * SIGMA_PER_MAD * middle
 
     def outliers(found: tuple[NDArray[np.float32], float] | None) -> int:
         return 0 if found is None else int(np.count_nonzero(np.abs(found[0]) > found[1]))
 
     # a pixel that blinks is in every pair; where something bright lands, its rings are no noise
-    few = starts[:: max(1, pairs // _FIRST_PAIRS)].tolist()
-    most = float(np.median([outliers(change(start)) for start in few])) + _MOST_MORE_OUTLIERS
+    few = starts[:: max(1, pairs // 9)].tolist()
+    most = float(np.median([outliers(change(start)) for start in few])) + 4
 
     def periodogram(start: int) -> FloatArray | None:
         found = change(start)

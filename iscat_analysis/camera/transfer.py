@@ -65,8 +65,6 @@ SIGMAS = 4.0
 
 _LEAST_FRAMES = 16
 _LEAST_PIXELS = 256
-_LEAST_NOISE = 1e-6  # of the shot noise; what has less, as a picture that was copied, has none
-_LEAST_SLOPE = 5.0  # standard errors of the slope, of which the line's zero is a quotient
 _TILE_PX = 16  # within which pixels may differ from the line together, as a speckle that shakes
 
 
@@ -117,7 +115,8 @@ def measure_transfer(
         )
     except DataError:
         return None
-    used &= ~unsteady([found], used) & (found.variance > _LEAST_NOISE * light)
+    # of the shot noise; what has less, as a picture that was copied, has none
+    used &= ~unsteady([found], used) & (found.variance > 1e-6 * light)
     if np.count_nonzero(used) < _LEAST_PIXELS:
         return None
     own = float((found.variance[used] / found.n_frames).mean())
@@ -149,7 +148,7 @@ def _binned(found: Moments, used: BoolArray, other: FloatArray) -> Transfer:
     freedom = np.full(mean.shape, found.n_frames - 1.0)
     (intercept, slope), cov = variance_line(mean, variance, freedom, tiles)
     noise = None
-    if slope > _LEAST_SLOPE * math.sqrt(cov[1, 1]):
+    if slope > 5.0 * math.sqrt(cov[1, 1]):
         gradient = np.array([-1 / slope, intercept / slope**2])
         noise = Estimate(-intercept / slope, math.sqrt(gradient @ cov @ gradient))
     seen = found.slope[used], found.slope_variance[used], mean
@@ -178,7 +177,6 @@ def _binned(found: Moments, used: BoolArray, other: FloatArray) -> Transfer:
 
 
 _LEAST_FRAMES, _ZERO_FRAMES = 16, 256
-_ZERO_COUNTS = 2**22  # of a movie's counts that are looked at: a tenth of a second
 
 
 @dataclass(frozen=True)
@@ -208,7 +206,7 @@ def find_zero(
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """
     pixels = counts.shape[1] * counts.shape[2]
-    most = min(_ZERO_FRAMES, max(_LEAST_FRAMES, _ZERO_COUNTS // pixels))
+    most = min(_ZERO_FRAMES, max(_LEAST_FRAMES, (2**22) // pixels))  # a tenth of a second
     found = measure_transfer(counts[:most], camera, masked=masked)
     return None if found is None else zero_of(found)
 
@@ -226,14 +224,11 @@ def zero_of(found: Transfer) -> LightZero | None:
 TOLD = 0.1
 """Error of the zero, as a share of the light, up to which the pixels tell it well enough."""
 
-_TOLD_IN_TIME = 0.25  # error of κ, from where frames tell nothing
 _LEAST_FRAMES, _LEAST_PIXELS = 16, 256
 _LEAST_UNEVEN, _OVER_LIGHT = 0.03, 2.0  # of the noise, and times that of the light
 _CLEAR = 6.0  # standard errors of what was done to the movie
 _QUANTILE = 0.15866  # of a normal law, one standard deviation below its middle
 _QUANTILE_ERROR = 3.2  # √n times the relative error of the square of that deviation
-_LARGEST_SQUARE = 25.0  # over the variance, of a change that counts: more is of a particle
-_SHARED = 1.5  # variance of a sum of squares of successive differences, which share a frame
 
 
 @dataclass(frozen=True)
@@ -272,7 +267,7 @@ def judge_zero(
         return None
     other = float(camera.dark_variance_e2(counts).mean())
     growth, error = _growth(steps, variance, power / level, other)
-    if error <= _TOLD_IN_TIME:
+    if error <= 0.25:  # frames tell nothing
         if abs(growth - 1) <= SIGMAS * error:
             return Zero(math.hypot(growth - 1, error), "", level)
         if growth + SIGMAS * error < level / (level + most_read_e2):
@@ -293,7 +288,7 @@ def _growth(
     Shapes: `steps` (t − 1, n), `variance` (n,), `power` (t,).
     """
     floor = np.maximum(variance, 1e-3 * np.median(variance))
-    seen = np.minimum(steps**2 / (2 * floor), _LARGEST_SQUARE).mean(axis=1)
+    seen = np.minimum(steps**2 / (2 * floor), 25.0).mean(axis=1)  # more is of a particle
     seen /= seen.mean()
     light = (power[1:] + power[:-1]) / 2
     light = light - light.mean()
@@ -303,7 +298,8 @@ def _growth(
     slope = float(light @ seen) / spread
     rest = float(np.var(seen - 1 - slope * light))
     share = max(1 - other / float(np.mean(variance)), 0.1)  # of the variance, that is of light
-    return slope / share, math.sqrt(_SHARED * rest / spread) / share
+    # successive differences share a frame
+    return slope / share, math.sqrt(1.5 * rest / spread) / share
 
 
 def _traces(steps: FloatArray, variance: FloatArray, mean: FloatArray) -> str:

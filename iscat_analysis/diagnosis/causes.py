@@ -34,12 +34,9 @@ FLAT = 0.05
 """Variance of the steps along z over that in the plane, below which particles move in a plane:
 near the coverslip those that do not have less along z too, but not so much less."""
 
-_LEAST_PIXELS = 100  # away from particles, of which the light is said to be uneven
 _DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE, Status.LARGE})
 _ENOUGH_STEPS = 30  # of particles that move, to tell their heights or their blur
 _FEWEST_ROWS, _FEWEST_RESIDUES = 5, 12  # rows of a kind that make it worth a line
-_NEARLY_ALL = 0.9  # of the particles have the other sign
-_MANY_SLOW = 0.1  # of the events are steps that are none
 _NORMAL = (0.4549, 1.3863)  # medians of χ² with one and two degrees of freedom
 
 
@@ -114,7 +111,7 @@ def uneven_warning(
     signal = np.zeros(level.shape) if explained is None else explained
     expected = level * (1 + signal) if config.optics.interferes else level + signal
     used &= np.isfinite(expected) & (expected > 0)
-    if used.sum() < _LEAST_PIXELS:
+    if used.sum() < 100:
         return None
     expected, after = expected[used], windows.after_e[used]
     light = after / expected
@@ -225,7 +222,7 @@ def sign_warning(config: Config, table: pd.DataFrame) -> Finding | None:
     """Find whether nearly all particles have the opposite sign of the model."""
     mass = table.loc[table["status"] == Status.OK.value, "mass_kda"].dropna()
     turned = int((mass < 0).sum())
-    if turned < _FEWEST_ROWS or turned < _NEARLY_ALL * len(mass):
+    if turned < _FEWEST_ROWS or turned < 0.9 * len(mass):
         return None
     brightens = float(table.loc[mass.index, "contrast"].median()) > 0
     change, other = ("brighten", "darken") if brightens else ("darken", "brighten")
@@ -242,7 +239,7 @@ def landing_rate_warning(table: pd.DataFrame) -> Finding | None:
     Their pictures may agree with the model; `Status.CHANGING` is about the light before and after.
     """
     slow = int(has_flag(table, Status.CHANGING).sum())
-    if slow < _FEWEST_ROWS or slow < _MANY_SLOW * len(table):
+    if slow < _FEWEST_ROWS or slow < 0.1 * len(table):
         return None
     return of.LIGHT_OF_EVENTS_CHANGES({"slow": slow, "of": len(table)})
 

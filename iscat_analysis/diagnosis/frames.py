@@ -33,8 +33,6 @@ from iscat_analysis.search.frames import DARK, cut_off, measure_frames, well_lit
 from iscat_analysis.units import are, frames_listed
 
 _MOST = 4  # channels that are looked for
-_ALIKE = 0.1  # of the mean square difference of others, by which frames of one channel differ
-_PIXELS = 4096  # that are asked, all over the field
 
 
 def refuse_channels(counts: NDArray[Any], camera: Camera, name: str) -> None:
@@ -60,7 +58,7 @@ def channels_of(counts: NDArray[Any], camera: Camera) -> int:
     Shapes: `counts` (t, y, x).
     """
     shape = counts.shape[1:]
-    every = max(1, -(-math.prod(shape) // _PIXELS))
+    every = max(1, -(-math.prod(shape) // 4096))
     cut = camera.mapped(lambda image: np.broadcast_to(image, shape).reshape(-1)[::every])
     light = cut.to_electrons(counts.reshape(len(counts), -1)[:, ::every])
     power = light.mean(axis=1, keepdims=True)
@@ -73,7 +71,7 @@ def channels_of(counts: NDArray[Any], camera: Camera) -> int:
         float(np.median(np.mean((light[n:] - light[:-n]) ** 2, axis=1)))
         for n in range(1, _MOST + 1)
     ]
-    found = (n for n in range(2, _MOST + 1) if apart[n - 1] < _ALIKE * min(apart[: n - 1]))
+    found = (n for n in range(2, _MOST + 1) if apart[n - 1] < 0.1 * min(apart[: n - 1]))
     return next(found, 1)
 
 

@@ -37,15 +37,8 @@ PAIRS = 12
 Half as many tell more of a large field, by the light of all its pixels.
 """
 
-_LEAST_PAIRS = 3  # of a range of frames
-_FRAMES_SUMMED = 8  # frames that are summed there
-_SINGLE_PAIRS = 24  # places where particles are followed
-# Of half the movie, of every second of these: what comes again must not be missed
-_SHORTER_GAP = 0.62
 # Every how many-th place in the background is also compared with the frames after it.
 _BACKGROUND_STRIDE = 2
-_FEWEST_OF_LARGE = 3  # frames that tell unsteady pixels, of so few places
-_SAMPLE_BYTES = 96_000_000  # of counts that are read for it
 
 
 class Pair(NamedTuple):
@@ -140,32 +133,32 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
     if large:
         pairs_wanted //= 2
     given = config.background.recorded, config.fit.frames
-    frames_each = _FRAMES_SUMMED
+    frames_each = 8
     if mode != "fixed":
         first, last = given[1] or (0, total)
         spans = [(first, min(last, total))]
         window = config.background.window_frames or longest_window(last - first)
         if mode == "tracks":
-            window, frames_each, pairs_wanted = (spans[0][1] - first) // 2, 1, _SINGLE_PAIRS
+            window, frames_each, pairs_wanted = (spans[0][1] - first) // 2, 1, 24
     else:
         before = given[0] or (0, 0)
         first, last = given[1] or (before[1], total)
         spans = [(before[0], min(before[1], total)), (first, min(last, total))]
         window = max(stop - start for start, stop in spans)
     frame_bytes = math.prod(movie.shape[1:]) * np.dtype(movie.dtype).itemsize
-    fewest = min(_FEWEST_OF_LARGE, frames_each) if large else 1
-    most = min(frames_each, max(_SAMPLE_BYTES // (2 * pairs_wanted * frame_bytes), fewest))
+    fewest = min(3, frames_each) if large else 1
+    most = min(frames_each, max(96_000_000 // (2 * pairs_wanted * frame_bytes), fewest))
     pairs_read: list[tuple[int, int]] = []
     parts: list[NDArray[Any]] = []
     for start, stop in spans:
         gap = min(window, (stop - start) // 2)
-        frames_each = min(most, gap, (stop - start - gap) // _LEAST_PAIRS)
+        frames_each = min(most, gap, (stop - start - gap) // 3)
         if frames_each < 1:
             continue
         room = stop - gap - frames_each - start
         # no pair has another's frames
         number = min(pairs_wanted // len(spans), room // frames_each + 1)
-        gaps = (gap, math.ceil(_SHORTER_GAP * gap)) if mode == "tracks" else (gap,)
+        gaps = (gap, math.ceil(0.62 * gap)) if mode == "tracks" else (gap,)
         for k, frame in enumerate(np.linspace(start, start + room, number).astype(int).tolist()):
             pairs_read.append((frame, frame + gaps[k % len(gaps)]))
             parts += [movie.read(k, k + frames_each) for k in pairs_read[-1]]

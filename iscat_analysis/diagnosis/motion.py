@@ -23,9 +23,6 @@ from iscat_analysis.records import FloatArray, Windows
 from iscat_analysis.search.frames import good_frames, well_lit
 from iscat_analysis.search.noise import measure_motion, measure_noise
 
-# Share of the variance of averages that motion must add; noise alone adds 1e-3.
-_LEAST_VARIANCE_SHARE = 0.03
-
 
 def with_drift_correction(config: Config, *, moves: bool) -> Config:
     """Set in the configuration whether the motion of the fixed pattern is divided out."""
@@ -45,7 +42,7 @@ def motion_in(opening: NoiseSurvey) -> str:
         for counts in (reader.opening(), last)
         if len(counts) >= 2
     )
-    if not share > _LEAST_VARIANCE_SHARE:
+    if not share > 0.03:  # noise alone adds 1e-3
         return ""
     return (
         f"the fixed pattern moves: averages of {length} frames differ by {1 + share:.3g} times "
@@ -56,11 +53,7 @@ def motion_in(opening: NoiseSurvey) -> str:
 DRIFT_PX = 0.02
 """Shift of the fixed pattern below which it is not worth a line."""
 
-_NOISE_BYTES = 64_000_000  # of counts on which the noise is measured
-_LONGEST = 100  # average of the noise curve
 _SMALLEST_PX = 32  # side of a field in which a pattern is followed, and of its parts
-_FEWEST_PARTS = 4  # whose differences tell an error
-_SIGNIFICANT = 4.0  # standard errors beyond which a drift is one
 
 
 def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[str, Any]:
@@ -69,10 +62,10 @@ def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[s
     limit = drift = error = None
     if windows.n_before >= 2 and is_lit(windows):
         frame_bytes = math.prod(movie.shape[1:]) * np.dtype(movie.dtype).itemsize
-        some = first_counts(movie, windows, max(2, _NOISE_BYTES // frame_bytes))
+        some = first_counts(movie, windows, max(2, 64_000_000 // frame_bytes))
         lit = well_lit(windows.power[: len(some)])
         some = some if lit.all() or lit.sum() < 2 else some[lit]
-        noise = measure_noise(some, camera, min(_LONGEST, len(some) // 2))
+        noise = measure_noise(some, camera, min(100, len(some) // 2))
         curve, limit = (noise.frames, noise.variance_over_shot), noise.shot_limited
         moved = _pattern_moved(windows)
         if moved is not None:
@@ -103,7 +96,7 @@ def _pattern_moved(windows: Windows) -> tuple[FloatArray, FloatArray] | None:
         for left in range(0, columns - side + 1, side)
     ]
     shifts = np.array([part[0] for part in parts if part is not None])
-    if len(shifts) < _FEWEST_PARTS:
+    if len(shifts) < 4:
         return whole
     apart = SIGMA_PER_MAD * np.median(np.abs(shifts - np.median(shifts, axis=0)), axis=0)
     return whole[0], np.maximum(whole[1], apart * math.sqrt(math.pi / 2 / len(shifts)))
@@ -134,6 +127,6 @@ def drift_warning(name: str, background: dict[str, Any]) -> Finding | None:
         return None
     (y, x), (y_error, x_error) = background["drift_px"], background["drift_error_px"]
     pull = math.hypot(y / y_error, x / x_error)
-    if math.hypot(y, x) <= DRIFT_PX or pull <= _SIGNIFICANT:
+    if math.hypot(y, x) <= DRIFT_PX or pull <= 4.0:
         return None
     return PATTERN_MOVED({"x_px": x, "y_px": y}, where=name)

@@ -62,9 +62,6 @@ from iscat_analysis.search.noise import (
 from iscat_analysis.search.templates import ExcessNoise
 from iscat_analysis.threads import one_thread_algebra
 
-# Of the noise, and of masses if it is the offset, that is not left unsaid
-_LEAST_NOISE_ERROR = 0.03
-_MOST_LEFT = 1.1  # of the noise that the light has, with an offset that the noise alone tells
 REPORTED_LAWS = ("other light", "read noise")
 """Laws by which noise is not what the camera's numbers predict, as `law_finding` has it."""
 
@@ -133,7 +130,8 @@ def offset_is_wrong(zero: LightZero, gain: GainDiagnosis) -> bool:
     if zero.flickers:
         return True
     left = gain.noise_ratio / (1 - zero.share)
-    return left < _MOST_LEFT and not (zero.share > 0 and gain.noise_ratio > 1)
+    # of the noise that the light has, with an offset that the noise alone tells
+    return left < 1.1 and not (zero.share > 0 and gain.noise_ratio > 1)
 
 
 def _offset_of(camera: Camera) -> str:
@@ -182,7 +180,7 @@ def offset_or_gain_finding(
     if (
         gain.shakes
         or gain.noise_counts < 1
-        or abs(share) < _LEAST_NOISE_ERROR + 3 * gain.noise_ratio_se
+        or abs(share) < 0.03 + 3 * gain.noise_ratio_se
         or (zero is not None and not zero.may_be(share))
     ):
         return None
@@ -217,13 +215,6 @@ SPECTRUM_FRAMES = 128
 """Background frames on which the spectrum of the noise is measured."""
 
 _GAIN_FRAMES = 64  # on which the gain is judged
-_FEWEST_FRAMES = 8  # on which it is judged beside particles that move
-_LEAST_FREE_SHARE = 0.25  # share of the pixels that no particle may come near in the frames judged
-# λ/NA from a particle, from where its light changes the variance by some per cent
-_LEAST_DISTANCE = 1.5
-_ENOUGH_FITS = 10  # of which the best
-_BEST_FITS = 0.1  # leave over the noise and no more; this quantile is theirs
-_MOST_NOISE_SHARE = 0.75  # of the noise, which small pictures leave over by chance at least
 
 
 @dataclass(frozen=True)
@@ -251,10 +242,11 @@ class Noise:
         Shapes: `chi2` (n,).
         """
         known = chi2[np.isfinite(chi2)]
-        if self.excess is None or len(known) < _ENOUGH_FITS:
+        if self.excess is None or len(known) < 10:
             return self
-        least = float(np.quantile(known, _BEST_FITS))
-        return Noise() if least < _MOST_NOISE_SHARE * self.excess.ratio else self
+        least = float(np.quantile(known, 0.1))  # leave over the noise and no more
+        # small pictures leave over as much by chance
+        return Noise() if least < 0.75 * self.excess.ratio else self
 
     @property
     def summary(self) -> dict[str, Any] | None:
@@ -361,15 +353,16 @@ def judge_beside(
     Shapes: `seen` (n,), `used` (y, x).
     """
     optics = context.config.optics
-    away = _LEAST_DISTANCE * optics.wavelength_nm / optics.na
+    # nearer, light changes the variance by some per cent
+    away = 1.5 * optics.wavelength_nm / optics.na
     y, x = np.indices(used.shape) * context.pixel_nm
     pixels = np.column_stack([x.ravel(), y.ravel()])
     frame, places_nm = seen
     count = min(_GAIN_FRAMES, span[1] - span[0])
-    while count >= _FEWEST_FRAMES:
+    while count >= 8:
         near = scipy.spatial.cKDTree(places_nm[(frame >= span[0]) & (frame < span[0] + count)])
         free = used & (near.query(pixels)[0] > away).reshape(used.shape)
-        if free.any() and free.sum() >= _LEAST_FREE_SHARE * used.sum():
+        if free.any() and free.sum() >= 0.25 * used.sum():
             counts = movie.read(span[0], span[0] + count)
             additive = context.additive
             if judge_counts(counts, camera, masked=~free, additive=additive).findings:

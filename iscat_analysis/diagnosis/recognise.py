@@ -45,17 +45,9 @@ LEAST_STEP_SHARE = 0.15
 """What the neighbouring differences may come to, as a part of a change that stays, or noise: rings
 of others make less."""
 
-_LEAST_PICTURE_SHARE = 0.1  # singular value of a picture over the norm of the change
-# The same over noise's; of noise the second is 1.2, the third 0.9, 1.3 in a fiftieth
-_LEAST_NOISE_RATIO = 1.5
-# Of the picture's share beside its centre, which the pixels there have at least
-_LEAST_NEIGHBOUR_SHARE = 0.5
-_NOISE_SIGMAS = 4.0  # standard deviations of noise
-_SPOT_SIGMA = 0.21  # standard deviation of a spot, in wavelengths over NA
 _REACH_SIGMAS = 4.5  # standard deviations of a spot, within which a picture is looked at
 _AROUND = 2  # blocks on either side that are looked at
 _LEAST_BLOCKS = 5
-_MOST_VALUES = 500_000  # values, whose median has an error of a few thousandths
 
 
 @dataclass(frozen=True)
@@ -95,7 +87,7 @@ def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
     one, two, _, four, five = (smooth[block + n, *position] for n in range(_LEAST_BLOCKS))
     change = size[block, *position]
     neighbouring = np.maximum(np.abs(two - one), np.abs(five - four)) / change
-    quiet = np.maximum(_NOISE_SIGMAS * noise / change, LEAST_STEP_SHARE)
+    quiet = np.maximum(4.0 * noise / change, LEAST_STEP_SHARE)
     pictures = _pictures(smooth, peaks, _REACH_SIGMAS * spot_px, noise)
     staying = (neighbouring < quiet) & (pictures == 1)
     return Changes(len(peaks), float(staying.mean()), float((pictures > 2).mean()))
@@ -113,9 +105,7 @@ def _pictures(
         seen = smooth[(slice(t, t + _LEAST_BLOCKS), *part)][:, near].astype(np.float64)
         strength = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
         change = np.linalg.norm(seen[_AROUND + 1] - seen[_AROUND - 1])
-        least = max(
-            _LEAST_PICTURE_SHARE * change, _LEAST_NOISE_RATIO * noise * math.sqrt(seen.shape[1] / 2)
-        )
+        least = max(0.1 * change, 1.5 * noise * math.sqrt(seen.shape[1] / 2))
         count[number] = max(int((strength > least).sum()), 1)
     return count
 
@@ -138,7 +128,7 @@ def _of_spots(
 
 def _median_deviation(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
     """Median absolute deviation of other − one, on a subsample of pixels."""
-    every = 1 + one.size // _MOST_VALUES
+    every = 1 + one.size // 500_000
     some = other.ravel()[::every] - one.ravel()[::every]
     deviation = some - middle(some.copy())
     return float(middle(np.abs(deviation, out=deviation)))
@@ -146,12 +136,12 @@ def _median_deviation(one: NDArray[np.floating], other: NDArray[np.floating]) ->
 
 def least_beside(spot_px: float) -> float:
     """Give the smallest share of a change that the pixels next to its centre have."""
-    return _LEAST_NEIGHBOUR_SHARE * math.exp(-0.5 / spot_px**2)
+    return 0.5 * math.exp(-0.5 / spot_px**2)
 
 
 def spot_of(wavelength_nm: float, na: float, pixel_nm: float) -> float:
     """Give the standard deviation of a particle's picture."""
-    return max(_SPOT_SIGMA * wavelength_nm / na / pixel_nm, 0.5)
+    return max(0.21 * wavelength_nm / na / pixel_nm, 0.5)  # in wavelengths over NA
 
 
 MOST_FRAMES = 2000
@@ -170,7 +160,6 @@ LEAST_MOVING = 0.4
 more from 0.1 to 1 µm²/s.  Where landings crowd, one and a leaving to 70 pixels in 400 frames, it
 is 0.14, and 0.36 at most."""
 
-_DIM = 0.5  # of the usual light, below which changes are damped
 
 LARGEST_CHANCE = 0.03
 """A movie is said to be of the other kind where so many changes have a smaller chance than this."""
@@ -215,7 +204,8 @@ def _damping(light_e: FloatArray, camera: Camera) -> NDArray[np.float32]:
     Shapes: `light_e`, result (y, x).
     """
     read = camera.read_variance_e2((light_e.shape[0], light_e.shape[1]))
-    half = _DIM * float(np.median(light_e[light_e > 0])) if (light_e > 0).any() else 1.0
+    # of the usual light
+    half = 0.5 * float(np.median(light_e[light_e > 0])) if (light_e > 0).any() else 1.0
     sharp = light_e / np.sqrt(np.maximum(light_e + read, 1.0))
     enough = half / math.sqrt(max(half + float(read.mean()), 1.0))
     return np.minimum(sharp / enough, 1.0).astype(np.float32)

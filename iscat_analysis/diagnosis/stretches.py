@@ -29,21 +29,11 @@ from iscat_analysis.search.noise import SHORTEST_MOVIE
 
 _GROUP, _READ = 16, 4  # frames from one group to the next, and how many of them are looked at
 _CELLS, _SMALLEST = 32, 4  # cells along the longer side, and their least side [px]
-_ROWS = 16  # of a cell, up to which all of them are looked at
 _FEWEST = 8  # groups that tell what is usual
-_LIT = 0.5  # of the usual light, without which a group says nothing
-_CLEAR = 5.0  # standard deviations of a cell
 _STEP_SHARE, _STEP_EVEN = 0.6, 0.15  # of the cells that a break changes, and how evenly (Gauss: ⅓)
-_STEP_SIZE = 0.1  # of the pattern's contrast, which changes in a break
 _LASTING, _LASTING_SHARE = 3, 0.2  # groups through which many cells go on changing
-_LASTING_SUM = 0.8  # and these shares in all; of a few bright particles, one after the other, 0.5
-_LASTING_SIZE = 0.05  # of the pattern's contrast, from one group to the next
-_MORE = 0.05  # of the cells, from where a change has begun
-_SUDDEN = 0.7  # of a change, which one frame makes
 _SAME, _LIKE, _OTHER = 0.99, 0.9, 0.5  # correlation of patterns: one, alike, and others
 _BRIGHTER, _FLATTER = 1.03, 0.985  # light and contrast of a pattern under more light
-_MOST_BREAKS = 12  # beyond which nothing is usual
-_LONG = 0.75  # of the longest stretch, from where a part tells as much as that
 
 
 @dataclass(frozen=True)
@@ -73,7 +63,7 @@ class Stretches:
     def main(self) -> tuple[int, int]:
         """The part that tells of camera, light and optics: the first of those that are long."""
         longest = max(stop - start for start, stop in self.kept)
-        return next(span for span in self.kept if span[1] - span[0] >= _LONG * longest)
+        return next(span for span in self.kept if span[1] - span[0] >= 0.75 * longest)
 
     def with_jumps(self, frames: Sequence[int]) -> Stretches:
         """Break where the focus jumps, too."""
@@ -143,13 +133,13 @@ def _breaks_within(movie: Stack, span: tuple[int, int]) -> Stretches:
         return whole
     groups = [_cells(movie, int(start), int(start) + _READ) for start in starts]
     light = np.array([one.mean() for one in groups])
-    lit = light > _LIT * float(np.quantile(light, 0.75))
+    lit = light > 0.5 * float(np.quantile(light, 0.75))
     starts, light = starts[lit], light[lit]
     cells = np.array([one / one.mean() for one, used in zip(groups, lit, strict=True) if used])
     if len(cells) < _FEWEST:
         return whole
     runs = _runs(cells)
-    if not runs or len(runs) > _MOST_BREAKS:
+    if not runs or len(runs) > 12:  # beyond which nothing is usual
         return whole
     found: list[Break] = []
     closed: int | None = None  # since when more light than before
@@ -194,7 +184,7 @@ def _cells(movie: Stack, start: int, stop: int, *, each: bool = False) -> FloatA
     side = max(_SMALLEST, math.ceil(max(rows, columns) / _CELLS))
     high, wide = max(rows // side, 1), max(columns // side, 1)
     tall, broad = min(side, rows), min(side, columns)
-    every = max(1, tall // _ROWS)
+    every = max(1, tall // 16)
     placed = movie.in_place(start, stop)
     counts = movie.read(start, stop) if placed is None else placed.counts
     part = counts[:, : high * tall, : wide * broad].reshape(-1, high, tall, wide * broad)
@@ -220,9 +210,9 @@ def _runs(cells: FloatArray) -> list[tuple[int, int]]:
     if not usable.any():
         return []
     change, scatter = change[:, usable], scatter[usable]
-    share = (np.abs(change) > _CLEAR * scatter).mean(axis=1)
+    share = (np.abs(change) > 5.0 * scatter).mean(axis=1)
     base = float(np.median(share))
-    begun = share > base + max(_MORE, 6 * float(np.median(np.abs(share - base))))
+    begun = share > base + max(0.05, 6 * float(np.median(np.abs(share - base))))
     pattern = seen[:, usable].mean(axis=0)
     contrast = float(np.std(pattern)) or 1.0
     found = []
@@ -231,12 +221,13 @@ def _runs(cells: FloatArray) -> list[tuple[int, int]]:
         part = change[first:last]
         size = np.sqrt(np.mean(part**2, axis=1)) / contrast
         even = np.mean(part**2, axis=1) ** 2 / np.maximum(np.mean(part**4, axis=1), 1e-300)
-        sudden = (share[first:last] > _STEP_SHARE) & (even > _STEP_EVEN) & (size > _STEP_SIZE)
+        sudden = (share[first:last] > _STEP_SHARE) & (even > _STEP_EVEN) & (size > 0.1)
         lasting = (
             last - first >= _LASTING
             and float(share[first:last].max()) > base + _LASTING_SHARE
-            and float(np.sum(share[first:last] - base)) > _LASTING_SUM
-            and float(np.median(size)) > _LASTING_SIZE
+            # of a few bright particles, one after the other, 0.5
+            and float(np.sum(share[first:last] - base)) > 0.8
+            and float(np.median(size)) > 0.05
         )
         if sudden.any() or lasting:
             found.append((first, last))
@@ -290,4 +281,4 @@ def _sudden(movie: Stack, start: int, stop: int) -> int | None:
     best = int(np.argmax([
         np.sum((frames[k] - frames[k - 1]) ** 2) for k in range(_READ, len(frames) - _READ + 1)
     ]))  # fmt: skip
-    return start + _READ + best if sizes[best] > _SUDDEN * whole else None
+    return start + _READ + best if sizes[best] > 0.7 * whole else None
