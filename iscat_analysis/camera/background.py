@@ -18,6 +18,7 @@ from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.errors import DataError
+from iscat_analysis.medians import robust_sigma
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress, Windows, silent
 from iscat_analysis.units import count
 
@@ -283,7 +284,7 @@ def _robust_ratio(windows: Windows) -> float:
         variance = ratio * before * (1 + (0 if known else ratio))
         variance = variance + windows.read_variance_after_e2[used]
         off = np.abs(after - ratio * before) / np.sqrt(np.maximum(variance, 1.0))
-        clip = 3.0 * max(1.0, float(np.median(off[kept])) / 0.6745)  # robust standard deviations
+        clip = 3.0 * max(1.0, robust_sigma(off[kept]))  # robust standard deviations
         kept_now = off < clip
         if np.array_equal(kept_now, kept) or kept_now.sum() < 0.1 * kept.size:
             break

@@ -37,7 +37,6 @@ from iscat_analysis.camera.moments import (
     clipped,
     mask_notes,
     moments_of,
-    robust_sigma,
     saturated,
     stand_out,
     unlike_neighbours,
@@ -52,6 +51,7 @@ from iscat_analysis.camera.regression import (
 )
 from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.errors import DataError
+from iscat_analysis.medians import robust_sigma
 from iscat_analysis.movie import SelectedFrames
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress, silent
 from iscat_analysis.units import listed

@@ -113,6 +113,11 @@ class Camera:
         return np.maximum(read, rounding)
 
 
+def float_type(stored: np.dtype[Any]) -> np.dtype[Any]:
+    """Type of what is computed from counts: single precision where these have 16 bits or fewer."""
+    return np.dtype(np.float32 if stored.itemsize <= 2 else np.float64)
+
+
 def rounding_variance_adu2(counts: NDArray[Any]) -> float:
     """Variance that rounding adds to counts: d²/12, d the largest step that all are multiples of.
 

@@ -26,7 +26,7 @@ from scipy import fft
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
 
 from iscat_analysis._kernels.drift import extend, mismatch, shift_equations
-from iscat_analysis.medians import median_3x3
+from iscat_analysis.medians import SIGMA_PER_MAD, median_3x3, robust_sigma
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
 
 ComplexArray = NDArray[np.complex128]
@@ -135,7 +135,7 @@ def _register(
             some = np.abs(deviation[::2, ::3])
             if np.isnan(some).all():
                 return nowhere
-            scale = max(1.4826 * float(np.nanmedian(some)), 1.0)
+            scale = max(SIGMA_PER_MAD * float(np.nanmedian(some)), 1.0)
             spurious = shift_equations(
                 moved,
                 pattern_read,
@@ -315,4 +315,4 @@ def _without_spikes(image: FloatArray) -> FloatArray:
     """Replace outlying pixels by the median of their neighbours."""
     around = median_3x3(image)
     out = np.abs(image - around)
-    return np.where(out > 6.0 * 1.4826 * np.median(out), around, image)
+    return np.where(out > 6.0 * robust_sigma(out), around, image)

@@ -41,19 +41,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 from numpy.typing import DTypeLike, NDArray
+from scipy.optimize import least_squares
 
-from iscat_analysis.camera.counts import Camera, converter_ceiling
+from iscat_analysis.camera.counts import Camera, converter_ceiling, float_type
 from iscat_analysis.camera.transfer import SIGMAS, TOLERANCE, Transfer
 from iscat_analysis.config import CameraConfig
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie import Stack
-from iscat_analysis.records import CountSource, FloatArray, StackMetadata
+from iscat_analysis.movie import ChangedFrames, Stack
+from iscat_analysis.records import FloatArray
 
 Kind = Literal[
     "linear", "offset", "other light", "read noise", "noisy light", "gamma", "saturation"
@@ -66,7 +68,6 @@ BENT: tuple[Kind, ...] = ("gamma", "saturation")
 
 
 _RARE = {"noisy light": 6.0, "other light": 2.0}  # of χ², by which these must be better still
-_STEP, _SETTLED, _STUCK = 1e-6, 1e-4, 1e6  # of numbers of laws, of χ², and damping
 
 
 @dataclass(frozen=True)
@@ -216,7 +217,9 @@ def _fitted(found: Transfer, u: FloatArray, family: _Family, offset: FloatArray)
 
     low, high = family.ends
     ends = np.array([[low, *(-3.0 + 0 * offset)], [high, *(0.9 + 0 * offset)]])
-    theta, chi2, covariance = _least_squares(residuals, np.array([family.start, *offset]), ends)
+    start = np.clip([family.start, *offset], *ends)
+    best = least_squares(residuals, start, bounds=ends, xtol=1e-10, x_scale="jac")
+    theta, covariance = best.x, np.linalg.pinv(best.jac.T @ best.jac)
     value, se = float(theta[0]), math.sqrt(float(covariance[0, 0]))
     shift = float(theta[1]) if offset.size else 0.0
     step = 1e-4
@@ -229,39 +232,9 @@ def _fitted(found: Transfer, u: FloatArray, family: _Family, offset: FloatArray)
         contrast=family.contrast(value) * (1 - shift),
         contrast_se=math.sqrt(max(float(gradient @ covariance @ gradient), 0.0)),
         offset=shift,
-        chi2=chi2,
+        chi2=2 * float(best.cost),
         flickers=found.flicker is not None,
     )
-
-
-def _least_squares(
-    residuals: Callable[[FloatArray], FloatArray], start: FloatArray, ends: FloatArray
-) -> tuple[FloatArray, float, FloatArray]:
-    """Minimise a sum of squares inside bounds: Levenberg and Marquardt, with differences.
-
-    Shapes: `start` (k,), `ends` (2, k), `theta` (k,), `covariance` (k, k).
-    """
-    low, high = ends
-    theta = np.clip(start, low, high)
-    rest, damping = residuals(theta), 1e-3
-    while True:
-        step = np.where(theta + _STEP < high, _STEP, -_STEP)
-        slopes = np.stack([(residuals(theta + d) - rest) / d.sum() for d in np.diag(step)], axis=1)
-        information = slopes.T @ slopes
-        while damping < _STUCK:
-            damped = information + damping * np.diag(np.diag(information) + 1e-300)
-            new = np.clip(theta - np.linalg.solve(damped, slopes.T @ rest), low, high)
-            tried = residuals(new)
-            if tried @ tried < rest @ rest:
-                break
-            damping *= 4
-        else:
-            break
-        gained = float(rest @ rest - tried @ tried)
-        theta, rest, damping = new, tried, damping / 8
-        if gained < _SETTLED:
-            break
-    return theta, float(rest @ rest), np.linalg.pinv(information)
 
 
 COLUMNS = ("counts", "photoelectrons")
@@ -302,40 +275,41 @@ class Response:
         return pd.DataFrame(dict(zip(COLUMNS, (self.counts, self.photoelectrons), strict=True)))
 
 
-class LinearFrames:
+@dataclass(frozen=True, eq=False)
+class LinearFrames(ChangedFrames):
     """Frames of a movie as photoelectrons."""
 
-    notes: tuple[str, ...] = ()
-    metadata = StackMetadata()
+    response: Response
 
-    def __init__(self, movie: CountSource, response: Response) -> None:
-        self._movie, self._response = movie, response
-        self.shape, self.name = movie.shape, movie.name
-        self.dtype = np.dtype(np.float32 if movie.dtype.itemsize <= 2 else np.float64)
-        whole = np.issubdtype(movie.dtype, np.unsignedinteger) and movie.dtype.itemsize <= 2
-        self._known: NDArray[Any] | None = None
-        if whole:
-            every = np.arange(np.iinfo(movie.dtype).max + 1)
-            self._known = response.of(every).astype(self.dtype)
-            self._known[-1] = response.full
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the photoelectrons."""
+        return float_type(self.source.dtype)
+
+    @cached_property
+    def _known(self) -> NDArray[Any] | None:
+        """Photoelectrons of every number that the stored type has, if these are few."""
+        stored = self.source.dtype
+        if not np.issubdtype(stored, np.unsignedinteger) or stored.itemsize > 2:
+            return None
+        known = self.response.of(np.arange(np.iinfo(stored).max + 1)).astype(self.dtype)
+        known[-1] = self.response.full
+        return known
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames.
 
         Shapes: result (stop − start, y, x).
         """
-        counts = self._movie.read(start, stop)
+        counts = self.source.read(start, stop)
         if self._known is None:
-            out: NDArray[Any] = self._response.of(counts).astype(self.dtype)
+            out: NDArray[Any] = self.response.of(counts).astype(self.dtype)
         else:
             out = self._known[counts]
         ceiling = converter_ceiling(counts)
         if math.isfinite(ceiling):
-            out[counts >= ceiling] = self._response.full
+            out[counts >= ceiling] = self.response.full
         return out
-
-    def close(self) -> None:
-        """Leave the movie open; it belongs to the caller."""
 
 
 def linear(movie: Stack, config: CameraConfig) -> Stack:

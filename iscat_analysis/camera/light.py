@@ -31,7 +31,7 @@ from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.background import find_defects
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.counts import Camera, float_type
 from iscat_analysis.camera.spectrum import measure_spectrum
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.camera import (
@@ -41,7 +41,8 @@ from iscat_analysis.findings.camera import (
     LIGHT_SMOOTH,
     LINES_FLICKER,
 )
-from iscat_analysis.records import BoolArray, CountSource, FloatArray, StackMetadata
+from iscat_analysis.movie import ChangedFrames
+from iscat_analysis.records import BoolArray, FloatArray
 
 Axes = tuple[FloatArray, FloatArray, BoolArray]
 """Functions of rows (y, k) and of columns (x, m), and which of their products are fitted (k, m)."""
@@ -312,7 +313,7 @@ class LightModel:
         if full.any():
             limit = camera.full_scale_adu
             steady[full] = counts[full] if limit is None else limit
-        out: NDArray[Any] = steady.astype(_divided_type(counts.dtype))
+        out: NDArray[Any] = steady.astype(float_type(counts.dtype))
         return out
 
     def taken(self, signal: FloatArray) -> FloatArray:
@@ -358,31 +359,24 @@ class PartOfLight:
         return (1 + signal) / self.taken(signal) - 1
 
 
-def _divided_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
-    return np.dtype(np.float32 if dtype.itemsize <= 2 else np.float64)
-
-
-class SteadyFrames:
+@dataclass(frozen=True, eq=False)
+class SteadyFrames(ChangedFrames):
     """Frames of a movie, each divided by its own unsteady light."""
 
-    notes: tuple[str, ...] = ()
-    metadata = StackMetadata()
+    light: LightModel
+    camera: Camera
 
-    def __init__(self, movie: CountSource, light: LightModel, camera: Camera) -> None:
-        self._movie, self._light, self._camera = movie, light, camera
-        self.shape = movie.shape
-        self.name = movie.name
-        self.dtype = _divided_type(movie.dtype)
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the divided counts."""
+        return float_type(self.source.dtype)
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames.
 
         Shapes: result (stop − start, y, x).
         """
-        return self._light.divided(self._movie.read(start, stop), self._camera)
-
-    def close(self) -> None:
-        """Leave the movie open; it belongs to the caller."""
+        return self.light.divided(self.source.read(start, stop), self.camera)
 
 
 def with_lines(

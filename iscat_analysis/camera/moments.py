@@ -18,9 +18,9 @@ from scipy.ndimage import median_filter
 
 from iscat_analysis.camera.counts import converter_ceiling
 from iscat_analysis.errors import DataError
+from iscat_analysis.medians import robust_sigma
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource
 
-_MAD_PER_SIGMA = 0.6744898
 _TOGETHER = {"frames": (1, 2), "rows": (2,), "columns": (1,)}  # axes of (t, y, x)
 
 
@@ -49,11 +49,6 @@ def blocks(stack: FrameSource) -> Iterator[tuple[int, int]]:
     size = max(2, (4 * 2**20) // (8 * rows * columns))
     for start in range(0, frames, size):
         yield start, min(start + size, frames)
-
-
-def robust_sigma(deviations: FloatArray) -> float:
-    """Estimate the standard deviation of normal deviations from their median size."""
-    return float(np.median(np.abs(deviations))) / _MAD_PER_SIGMA
 
 
 def brightness_bins(mean: FloatArray) -> list[NDArray[np.intp]]:

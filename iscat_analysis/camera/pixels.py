@@ -31,6 +31,7 @@ from iscat_analysis._kernels.unsteady import add_image, add_scatter, block_extre
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.camera import PIXELS_UNSTEADY, TEXT_BURNT_IN
+from iscat_analysis.medians import SIGMA_PER_MAD, robust_sigma
 from iscat_analysis.movie import ChangedFrames, Stack
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.units import count, listed
@@ -131,7 +132,7 @@ def find_text(movie: Stack, span: tuple[int, int]) -> BoolArray | None:
     ink, share = _commonest(series)
     light = np.where(series == ink, np.nan, series)
     light[:, share == 1] = 0.0  # nothing but ink, or dead
-    scatter = 1.4826 * np.nanmedian(np.abs(light - np.nanmedian(light, axis=0)), axis=0)
+    scatter = SIGMA_PER_MAD * np.nanmedian(np.abs(light - np.nanmedian(light, axis=0)), axis=0)
     apart = np.nanmin(np.abs(light - ink), axis=0) > 5.0 * np.maximum(scatter, 1.0)
     inked = apart & (share >= max(_AGAIN, 3 / len(counts))) & (share <= 1 - _AGAIN)
     letters = np.zeros(doubtful.shape, dtype=np.bool_)
@@ -184,7 +185,6 @@ def _commonest(series: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np
 
 
 _AROUND = 5  # pixels along each side, whose median tells how counts scatter there
-_SIGMA_PER_MAD = 1.4826  # standard deviation of a normal law over its median deviation
 _LINE_SHARE = 0.5  # of the pixels of a line that is named as such
 
 
@@ -296,7 +296,7 @@ def _noisy_lines(ratio: FloatArray, lit: BoolArray, usual: float, least_beside: 
             continue
         seen = np.where(lit, ratio, np.nan).take(lines, axis=1 - axis)
         excess = np.nanmedian(seen, axis=axis) - usual
-        spread = _SIGMA_PER_MAD * float(np.median(np.abs(excess - np.median(excess))))
+        spread = robust_sigma(excess - np.median(excess))
         padded = np.pad(excess, 1, mode="reflect")
         neighbours = np.maximum(padded[:-2], padded[2:])
         off = excess > max(0.15 * usual, 8.0 * spread)

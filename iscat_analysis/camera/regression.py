@@ -16,8 +16,9 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from iscat_analysis.camera.moments import Moments, robust_sigma
+from iscat_analysis.camera.moments import Moments
 from iscat_analysis.errors import DataError
+from iscat_analysis.medians import robust_sigma
 from iscat_analysis.records import BoolArray, FloatArray
 
 _Z95 = 1.959964

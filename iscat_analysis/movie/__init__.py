@@ -38,6 +38,7 @@ from iscat_analysis.movie.stack import (
     Stack,
     StackFrames,
     not_shared,
+    single_frame,
 )
 from iscat_analysis.movie.tiff import open_tiff
 from iscat_analysis.records import StackMetadata
@@ -116,4 +117,7 @@ def open_stack(
     source = "arguments" if any(value is not None for value in arguments.values()) else "none"
     metadata = StackMetadata(pixel_size_nm, exposure_ms, frame_rate_hz, source=source)
     name = name or "array"
-    return Stack(Path(name), ArrayFrames(movie, name, metadata), files=())
+    frames = ArrayFrames(movie, name, metadata)
+    if frames.shape[0] < 2:
+        raise single_frame(name)
+    return Stack(Path(name), frames, files=())

@@ -87,29 +87,36 @@ _DIALECTS = (
 )
 
 
-class RefeynFrames:
-    """The frames of an ``.mp`` file; `open_refeyn` makes it."""
+class DatasetFrames:
+    """The frames of a dataset; of MATLAB, whose axes are (t, x, y), `by_columns`."""
 
-    def __init__(self, stored: StoredArray, reader: Hdf5Reader, path: Path) -> None:
-        t, y, x = stored.shape
-        self._stored = stored
-        self._data = reader.data
-        self._path = path
-        self.shape = (t, y, x)
+    def __init__(
+        self,
+        stored: StoredArray,
+        reader: Hdf5Reader,
+        metadata: StackMetadata | None = None,
+        notes: tuple[str, ...] = (),
+        *,
+        by_columns: bool = False,
+    ) -> None:
+        self._stored, self._data, self._by_columns = stored, reader.data, by_columns
+        y, x = stored.shape[:-3:-1] if by_columns else stored.shape[-2:]
+        self.shape = (stored.shape[0], y, x)
         self.dtype = stored.dtype
-        self.metadata = StackMetadata()
-        self.notes: tuple[str, ...] = ()
+        self.metadata, self.notes = metadata or StackMetadata(), notes
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames ``[start, stop)`` as a new array in native byte order [counts]."""
-        return self._stored.read(start, stop)
+        counts = self._stored.read(start, stop)
+        counts = counts.reshape(len(counts), *counts.shape[-2:])
+        return np.ascontiguousarray(counts.transpose(0, 2, 1) if self._by_columns else counts)
 
     def close(self) -> None:
         """Release the file."""
         self._data.close()
 
 
-class DifferenceFrames(RefeynFrames):
+class DifferenceFrames(DatasetFrames):
     """A movie stored as differences, which are summed as it is read.
 
     Some decoded frames are kept, so that a read need not start at the first frame.  A movie that is
@@ -124,8 +131,8 @@ class DifferenceFrames(RefeynFrames):
         *,
         known: tuple[int, NDArray[Any]] | None,
     ) -> None:
-        super().__init__(stored, reader, path)
-        self._known = known
+        super().__init__(stored, reader)
+        self._path, self._known = path, known
         frame_bytes = self.shape[1] * self.shape[2] * stored.dtype.itemsize
         kept = max(1, min(self.shape[0], ANCHOR_BYTES // frame_bytes))
         self._spacing = -(-self.shape[0] // kept)
@@ -179,28 +186,14 @@ class DifferenceFrames(RefeynFrames):
             )
 
 
-def open_refeyn(path: Path) -> RefeynFrames:
-    """Open a Refeyn ``.mp`` movie, or ``.mpr``, which holds one."""
-    with closing(Hdf5Reader(path)) as reader:
-        try:
-            return _open(reader, path)
-        except BaseException:
-            reader.data.close()
-            raise
-
-
 def is_refeyn(reader: Hdf5Reader) -> bool:
     """Tell whether a file has frames where one of Refeyn's has them."""
     return any(reader.array(dialect.frames) is not None for dialect in _DIALECTS)
 
 
-def _open(reader: Hdf5Reader, path: Path) -> RefeynFrames:
+def _open_refeyn(reader: Hdf5Reader, path: Path) -> DatasetFrames:
+    """Open a Refeyn ``.mp`` movie, or ``.mpr``, which holds one."""
     found = [dialect for dialect in _DIALECTS if reader.array(dialect.frames) is not None]
-    if not found:
-        raise DataError(
-            f"{path}: is an HDF5 file but not a Refeyn movie (it has neither frame nor "
-            "movie/frame); export the movie as TIFF"
-        )
     dialect = next((d for d in found if reader.number(d.rate) is not None), found[0])
     stored = reader.array(dialect.frames)
     if stored is None or len(stored.shape) != 3 or 0 in stored.shape:
@@ -210,21 +203,16 @@ def _open(reader: Hdf5Reader, path: Path) -> RefeynFrames:
             "export it again"
         )
     _, rows, columns = stored.shape
-    if stored.shape[0] < 2:
-        raise DataError(
-            f"{path}: holds a single frame; a movie needs frames before and after a particle binds"
-        )
     frame_bytes = rows * columns * stored.dtype.itemsize
     if frame_bytes > max(_BLOCK_BYTES, _MOST_FRAME_DECODED_RATIO * len(reader.data)):
         raise DataError(
             f"{path}: a frame of {rows} x {columns} pixels would be {frame_bytes} bytes, from a "
             f"file of {len(reader.data)}; the file is damaged, export it again"
         )
-    frames = RefeynFrames(stored, reader, path)
+    frames = DatasetFrames(stored, reader)
     if stored.dtype.kind == "u" and dialect.keyframes is not None:
         frames = _differences(reader, dialect, stored, path) or frames
-    hints, frames.notes = _hints(reader, dialect)
-    frames.metadata = merge([hints], path)
+    frames.metadata, frames.notes = _described(reader, dialect, path)
     return frames
 
 
@@ -274,7 +262,10 @@ def _last_keyframe(
     return number, keyframes.read(last, last + 1)[0]
 
 
-def _hints(reader: Hdf5Reader, dialect: _Dialect) -> tuple[Hints, tuple[str, ...]]:
+def _described(
+    reader: Hdf5Reader, dialect: _Dialect, path: Path
+) -> tuple[StackMetadata, tuple[str, ...]]:
+    """Read timing and binning, from which the size of a pixel follows."""
     named = (reader.text(name) for name in dialect.names)
     instrument = next((name for name in named if name), dialect.instrument)
     frame_binning = positive(reader.number(dialect.frame_binning)) or 1.0
@@ -282,14 +273,15 @@ def _hints(reader: Hdf5Reader, dialect: _Dialect) -> tuple[Hints, tuple[str, ...
     rate = positive(reader.number(dialect.rate), 1 / frame_binning)
     exposure = positive(reader.number(dialect.exposure), frame_binning)
     unbinned = PIXEL_NM.get(instrument or "")
-    if unbinned is None or pixel_binning is None:
-        return Hints("refeyn", exposure_ms=exposure, frame_rate_hz=rate), ()
-    pixel = unbinned * pixel_binning
+    pixel = unbinned * pixel_binning if unbinned and pixel_binning else None
+    known = merge([Hints(StackMetadata(pixel, exposure, rate, source="refeyn"))], path)
+    if pixel is None:
+        return known, ()
     note = (
         f"the file does not store its pixel size; that of every {instrument} is {unbinned:g} nm "
         f"times the pixel binning of {pixel_binning:g}: {pixel:g} nm"
     )
-    return Hints("refeyn", pixel, pixel, exposure, rate), (note,)
+    return known, (note,)
 
 
 _MOST_NAMES = 1000  # that are looked at
@@ -297,38 +289,12 @@ _MOST_GROUPS = 8  # one inside the other, in which movies are looked for; named,
 _OF_CELLS = "#"  # begins the names of groups in which MATLAB keeps what cells refer to
 
 
-class DatasetFrames:
-    """The frames of a dataset; `open_hdf5` makes it."""
-
-    metadata = StackMetadata()
-
-    def __init__(
-        self, stored: StoredArray, reader: Hdf5Reader, notes: tuple[str, ...], *, by_columns: bool
-    ) -> None:
-        self._stored, self._data, self._by_columns = stored, reader.data, by_columns
-        y, x = stored.shape[:-3:-1] if by_columns else stored.shape[-2:]
-        self.shape = (stored.shape[0], y, x)
-        self.dtype = stored.dtype
-        self.notes = notes
-
-    def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Read frames ``[start, stop)`` as a new array in native byte order [counts]."""
-        counts = self._stored.read(start, stop)
-        counts = counts.reshape(len(counts), *counts.shape[-2:])
-        return np.ascontiguousarray(counts.transpose(0, 2, 1) if self._by_columns else counts)
-
-    def close(self) -> None:
-        """Release the file."""
-        self._data.close()
-
-
 def open_hdf5(path: Path, part: str, *, by_columns: bool = False) -> Frames:
     """Open a movie in an HDF5 file, with the axes (t, y, x) or, of MATLAB, (t, x, y)."""
     with closing(Hdf5Reader(path)) as reader:
         try:
             if not part and is_refeyn(reader):
-                reader.data.close()
-                return open_refeyn(path)
+                return _open_refeyn(reader, path)
             names = [part.strip("/")] if part else list(_movies(reader))
             if not names:
                 raise DataError(
@@ -350,7 +316,7 @@ def open_hdf5(path: Path, part: str, *, by_columns: bool = False) -> Frames:
                     f"a program has it open to write, or ended without closing it: the "
                     f"{stored.shape[0]} frames are those that were written until now"
                 )
-            return DatasetFrames(stored, reader, tuple(notes), by_columns=by_columns)
+            return DatasetFrames(stored, reader, notes=tuple(notes), by_columns=by_columns)
         except BaseException:
             reader.data.close()
             raise

@@ -125,25 +125,10 @@ Resolution = tuple[float, float, int]
 
 @dataclass(frozen=True)
 class Hints:
-    """Values from one kind of metadata: lengths in nm, exposure in ms, frame rate in Hz.
+    """What one kind of metadata says, the side of pixels along y, and notes as in `Frames`."""
 
-    None where a value is missing; `ticks`, `displayed_hz` and `source` are as in `StackMetadata`,
-    `notes` as in `Frames`.
-    """
-
-    source: str
-    pixel_x_nm: float | None = None
+    known: StackMetadata
     pixel_y_nm: float | None = None
-    exposure_ms: float | None = None
-    frame_rate_hz: float | None = None
-    ticks: tuple[int, ...] | None = None
-    gain_e_per_adu: float | None = None
-    offset_adu: float | None = None
-    wavelength_nm: float | None = None
-    na: float | None = None
-    magnification: float | None = None
-    binning: float | None = None
-    displayed_hz: float | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -229,10 +214,11 @@ def imagej_hints(text: str, resolution: Resolution | None) -> Hints:
     seconds = TIME_S.get(fields.get("tunit", "s").lower())
     interval = positive(fields.get("finterval"), seconds) if seconds else None
     gain, offset = _imagej_counts(fields)
-    return Hints(
-        "imagej", x_nm, y_nm, frame_rate_hz=inverse(interval), gain_e_per_adu=gain,
-        offset_adu=offset, displayed_hz=positive(fields.get("fps")),
+    known = StackMetadata(
+        x_nm, frame_rate_hz=inverse(interval), gain_e_per_adu=gain, offset_adu=offset,
+        displayed_hz=positive(fields.get("fps")), source="imagej",
     )  # fmt: skip
+    return Hints(known, y_nm)
 
 
 def _imagej_counts(fields: Mapping[str, str]) -> tuple[float | None, float | None]:
@@ -313,12 +299,11 @@ def micro_manager_hints(
     nominal = None if interval is None else positive(1e3 / interval)
     rate, notes = chosen_rate(clock, len(times_ms), nominal, ("Interval_ms", "ElapsedTime-ms"))
     told = told_by(begin)
-    return Hints(
-        "micromanager", pixel, pixel, exposure_ms=exposure,
-        frame_rate_hz=rate or told.frame_rate_hz, ticks=clock[1],
-        gain_e_per_adu=told.gain_e_per_adu, offset_adu=told.offset_adu, binning=told.binning,
-        notes=notes,
+    known = StackMetadata(
+        pixel, exposure, rate or told.frame_rate_hz, clock[1], told.gain_e_per_adu,
+        told.offset_adu, binning=told.binning, source="micromanager",
     )  # fmt: skip
+    return Hints(known, pixel, notes)
 
 
 def metamorph_hints(settings: object, planes: object) -> Hints:
@@ -329,16 +314,17 @@ def metamorph_hints(settings: object, planes: object) -> Hints:
     x_nm, y_nm = (positive(said.get(f"{axis}Calibration"), unit) if unit else None for axis in "XY")
     days, ms = (np.asarray(times.get(name, ()), float) for name in ("DateCreated", "TimeCreated"))
     rate, ticks = measure_clock(dict(enumerate((_DAY_S * (days - days[:1]) + ms / 1e3).tolist())))
-    return Hints("metamorph", x_nm, y_nm, frame_rate_hz=rate, ticks=ticks)
+    known = StackMetadata(x_nm, frame_rate_hz=rate, ticks=ticks, source="metamorph")
+    return Hints(known, y_nm)
 
 
 def plain_hints(resolution: Resolution | None) -> Hints:
     """Read the TIFF resolution tags, where they could mean a microscope's pixels."""
     if resolution is None or resolution[2] not in _RESOLUTION_UNIT_NM:
-        return Hints("tiff")
-    unit = _RESOLUTION_UNIT_NM[resolution[2]]
-    x_nm, y_nm = unit / resolution[0], unit / resolution[1]
-    return Hints("tiff", x_nm, y_nm) if _plausible(x_nm, y_nm) else Hints("tiff")
+        return Hints(StackMetadata())
+    x_nm, y_nm = (_RESOLUTION_UNIT_NM[resolution[2]] / per for per in resolution[:2])
+    known = StackMetadata(x_nm, source="tiff") if _plausible(x_nm, y_nm) else StackMetadata()
+    return Hints(known, y_nm)
 
 
 def positive(value: object, factor: float = 1.0) -> float | None:
@@ -359,32 +345,19 @@ def inverse(value: float | None) -> float | None:
 
 def merge(hints: Sequence[Hints], path: Path) -> StackMetadata:
     """Take each value from the first kind of metadata that has it."""
-    found: dict[str, float] = {}
+    found: dict[str, Any] = {}
     sources = []
     for hint in hints:
-        x, y = hint.pixel_x_nm, hint.pixel_y_nm
-        given = {
-            "pixel_size_nm": x,
-            "exposure_ms": hint.exposure_ms,
-            "frame_rate_hz": hint.frame_rate_hz,
-            "gain_e_per_adu": hint.gain_e_per_adu,
-            "offset_adu": hint.offset_adu,
-            "wavelength_nm": hint.wavelength_nm,
-            "na": hint.na,
-            "magnification": hint.magnification,
-            "binning": hint.binning,
-            "displayed_hz": hint.displayed_hz,
-        }
-        fresh = {key: n for key, n in given.items() if n is not None and key not in found}
+        fresh = {key: value for key, value in hint.known.values.items() if key not in found}
+        x, y = hint.known.pixel_size_nm, hint.pixel_y_nm
         if "pixel_size_nm" in fresh and x and y and abs(y / x - 1) > _SQUARE_TOLERANCE:
             raise DataError(
                 f"{path}: its pixels measure {x:g} nm in x and {y:g} nm in y, but they must be "
                 "square; correct the metadata, or resample the movie"
             )
         found |= fresh
-        sources += [hint.source] if fresh else []
-    ticks = next((hint.ticks for hint in hints if hint.ticks is not None), None)
-    return StackMetadata(**found, ticks=ticks, source="+".join(sources) or "none")
+        sources += [hint.known.source] if fresh.keys() - {"ticks"} else []
+    return StackMetadata(**found, source="+".join(sources) or "none")
 
 
 def _plausible(*sizes_nm: float | None) -> bool:

@@ -34,7 +34,7 @@ from iscat_analysis.movie.plain import (
 )
 from iscat_analysis.movie.plain import SUFFIXES as RECORDED
 from iscat_analysis.movie.side_files import with_side_files
-from iscat_analysis.movie.stack import Frames, Stack
+from iscat_analysis.movie.stack import Frames, Stack, single_frame
 from iscat_analysis.movie.tiff import TIFF_SUFFIXES, first_texts, open_tiff
 from iscat_analysis.reading import is_file, open_regular
 
@@ -204,6 +204,9 @@ def open_file(address: Path) -> Stack:
             f"{path}: {_needed()} but is not one; {_EXPORT} or, if it is plain numbers, say so, "
             f'as in "{path}{MARK}1500x128x128,uint16"'
         )
+    if frames.shape[0] < 2:
+        frames.close()
+        raise single_frame(path)
     files = getattr(frames, "files", files_of(path) if folder else None)
     known = with_side_files(frames.metadata, path)
     stack = Stack(path, frames, part=part, files=files, metadata=known)

@@ -29,6 +29,7 @@ from iscat_analysis.movie.descriptions import (
 )
 from iscat_analysis.movie.mapped import refuse_growth
 from iscat_analysis.reading import first_line
+from iscat_analysis.records import StackMetadata
 
 _CZI_TYPES = {"Gray8": "u1", "Gray16": "u2", "Gray32": "u4", "Gray32Float": "f4"}
 
@@ -95,7 +96,7 @@ def open_nd2(path: Path, _: str = "") -> ReaderFrames:
                 )
             if said.compressionType == "lossy":
                 raise DataError(f"{path}: its lossy compression keeps no counts; record without it")
-            hints = _if_readable(lambda: _nd2_hints(file, n_frames)) or Hints("nd2")
+            hints = _if_readable(lambda: _nd2_hints(file, n_frames)) or Hints(StackMetadata())
             return ReaderFrames(
                 path, (n_frames, y, x), np.dtype(file.dtype), hints,
                 axis=axis, frame=file.read_frame, close=file.close,
@@ -121,7 +122,7 @@ def open_czi(path: Path, _: str = "") -> ReaderFrames:
                     f"{path}: holds pixels of type {', '.join(sorted(kinds)) or 'unknown'}; export "
                     "the camera's grey values"
                 )
-            hints = _if_readable(lambda: _czi_hints(file)) or Hints("czi")
+            hints = _if_readable(lambda: _czi_hints(file)) or Hints(StackMetadata())
             return ReaderFrames(
                 path, (ranges[axis], y, x), np.dtype(_CZI_TYPES[kinds.pop()]), hints,
                 axis=axis, frame=lambda k: np.asarray(file.read(plane={axis: k})),
@@ -135,14 +136,15 @@ def open_czi(path: Path, _: str = "") -> ReaderFrames:
 def _nd2_hints(file: Any, n_frames: int) -> Hints:
     """Read pixel size, lens and the times of all frames."""
     times = file.events(orient="list").get("Time [s]", ())
-    known = {k: time for k, time in enumerate(times) if math.isfinite(time)}
-    rate, ticks = measure_clock(known if len(times) == n_frames else {})  # of nothing but frames
+    seconds = {k: time for k, time in enumerate(times) if math.isfinite(time)}
+    rate, ticks = measure_clock(seconds if len(times) == n_frames else {})  # of nothing but frames
     voxel, lens = file.voxel_size(), _of(file.metadata, "channels", 0, "microscope")
-    return Hints(
-        "nd2", positive(voxel.x, 1e3), positive(voxel.y, 1e3), frame_rate_hz=rate, ticks=ticks,
+    known = StackMetadata(
+        positive(voxel.x, 1e3), frame_rate_hz=rate, ticks=ticks, source="nd2",
         na=positive(_of(lens, "objectiveNumericalAperture")),
         magnification=positive(_of(lens, "objectiveMagnification")),
     )  # fmt: skip
+    return Hints(known, positive(voxel.y, 1e3))
 
 
 def _czi_hints(file: Any) -> Hints:
@@ -152,11 +154,12 @@ def _czi_hints(file: Any) -> Hints:
     metres = {each.get("@Id"): each.get("Value") for each in scaling}
     positions = _of(said, "Information", "Image", "Dimensions", "T", "Positions")
     lens = _of(said, "Information", "Instrument", "Objectives", "Objective")
-    return Hints(
-        "czi", positive(metres.get("X"), 1e9), positive(metres.get("Y"), 1e9),
+    known = StackMetadata(
+        positive(metres.get("X"), 1e9), source="czi", na=positive(_of(lens, "LensNA")),
         frame_rate_hz=inverse(positive(_of(positions, "Interval", "Increment"))),
-        na=positive(_of(lens, "LensNA")), magnification=positive(_of(lens, "NominalMagnification")),
+        magnification=positive(_of(lens, "NominalMagnification")),
     )  # fmt: skip
+    return Hints(known, positive(metres.get("Y"), 1e9))
 
 
 def _if_readable(read: Callable[[], Hints]) -> Hints | None:

@@ -30,6 +30,7 @@ from iscat_analysis.movie.descriptions import (
 )
 from iscat_analysis.movie.side_files import LARGEST_NA, told_by
 from iscat_analysis.reading import is_file
+from iscat_analysis.records import StackMetadata
 
 _OME_ROOT = re.compile(r"<(?:\w+:)?OME[\s>]")
 _AXES = ("T", "Z", "C")
@@ -272,10 +273,9 @@ def _hints(root: ElementTree.Element, pixels: ElementTree.Element, axis: str) ->
     exposure = next((value for value in exposures if value is not None), None)
     objective = _objective(root, pixels)
     na = None if objective is None else positive(objective.get("LensNA"))
-    return Hints(
-        "ome",
-        pixel_x_nm=_length(pixels, "PhysicalSizeX"),
-        pixel_y_nm=_length(pixels, "PhysicalSizeY"),
+    magnification = None if objective is None else positive(objective.get("NominalMagnification"))
+    known = StackMetadata(
+        pixel_size_nm=_length(pixels, "PhysicalSizeX"),
         exposure_ms=exposure or told.exposure_ms,
         frame_rate_hz=rate or told.frame_rate_hz,
         ticks=clock[1],
@@ -283,12 +283,11 @@ def _hints(root: ElementTree.Element, pixels: ElementTree.Element, axis: str) ->
         offset_adu=told.offset_adu,
         wavelength_nm=_wavelength_nm(pixels),
         na=na if na is not None and na < LARGEST_NA else None,
-        magnification=None
-        if objective is None
-        else positive(objective.get("NominalMagnification")),
+        magnification=magnification,
         binning=_binning(pixels) or told.binning,
-        notes=notes,
+        source="ome",
     )
+    return Hints(known, _length(pixels, "PhysicalSizeY"), notes)
 
 
 def _objective(

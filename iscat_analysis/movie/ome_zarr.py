@@ -256,5 +256,5 @@ def _scale(
         for axis, table in (("x", LENGTH_NM), ("y", LENGTH_NM), ("t", TIME_S))
         if (unit := table.get(units[axis])) is not None
     }
-    rate = inverse(known.get("t"))
-    return merge([Hints("ome-zarr", known.get("x"), known.get("y"), None, rate)], Path(name))
+    scaled = StackMetadata(known.get("x"), frame_rate_hz=inverse(known.get("t")), source="ome-zarr")
+    return merge([Hints(scaled, known.get("y"))], Path(name))

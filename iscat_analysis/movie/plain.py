@@ -43,7 +43,7 @@ from iscat_analysis.movie.mapped import (
     release,
     unmap,
 )
-from iscat_analysis.movie.stack import FileSet
+from iscat_analysis.movie.stack import FileSet, single_frame
 from iscat_analysis.reading import first_line, is_file, open_regular, read_text
 from iscat_analysis.records import InPlace, StackMetadata
 
@@ -122,18 +122,12 @@ class MappedFrames:
         *,
         offset: int,
         axes: Axes = ROWS_TOGETHER,
-        member: bool = False,
         notes: tuple[str, ...] = (),
     ) -> None:
         if len(shape) != 3 or min(shape) < 1 or stored.kind not in "uif":
             raise DataError(
                 f"{path}: needs to be frames (t, y, x) of integers or floats but is {stored} of "
                 f"shape {shape}; save the camera's counts, one frame after the other"
-            )
-        if shape[0] < 2 and not member:
-            raise DataError(
-                f"{path}: holds a single frame; a movie needs frames before and after a particle "
-                "binds"
             )
         self._path, self._data = path, map_file(path)
         needed = offset + math.prod(shape) * stored.itemsize
@@ -329,15 +323,13 @@ def open_recorded(path: Path) -> FileSet:
         files = recorded_files(path)
         rows, columns, stored, counts = _counted(files[:-1], files[-1])
     if sum(counts.values()) < 2:
-        raise DataError(
-            f"{path}: holds a single frame; a movie needs frames before and after a particle binds"
-        )
+        raise single_frame(path)
     members = []
     with ExitStack() as opened:
         for each, count in counts.items():
             if count:
                 shape = (count, rows, columns)
-                members.append(MappedFrames(each, shape, stored, offset=0, member=True))
+                members.append(MappedFrames(each, shape, stored, offset=0))
                 opened.callback(members[-1].close)
         if named is not None:
             refuse_disorder(members[0], Layout(*named[:3], stored.str), path)

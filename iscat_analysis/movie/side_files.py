@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from iscat_analysis.config import WAVELENGTH_NM
@@ -70,22 +70,7 @@ _PYLABLIB = {"exposure": ("exposure_ms", 1e3), "frame_period": ("interval_s", 1.
 _OFF = {"0", "false", "off"}
 
 
-@dataclass(frozen=True)
-class Told:
-    """What names and values tell of a recording; None where they are silent."""
-
-    pixel_size_nm: float | None = None
-    exposure_ms: float | None = None
-    frame_rate_hz: float | None = None
-    gain_e_per_adu: float | None = None
-    offset_adu: float | None = None
-    wavelength_nm: float | None = None
-    na: float | None = None
-    magnification: float | None = None
-    binning: float | None = None
-
-
-def told_by(properties: Mapping[str, object]) -> Told:
+def told_by(properties: Mapping[str, object]) -> StackMetadata:
     """Read the names that are known.
 
     A name that two devices have tells nothing: it is not known which of them recorded.
@@ -109,7 +94,7 @@ def told_by(properties: Mapping[str, object]) -> Told:
         del found["wavelength_nm"]
     if found.get("na", 0.0) >= LARGEST_NA:
         del found["na"]
-    return Told(**found)
+    return replace(StackMetadata(), **found)  # type: ignore[arg-type]
 
 
 def _timings(values: Mapping[str, object]) -> dict[str, object]:
@@ -167,9 +152,7 @@ def with_side_files(metadata: StackMetadata, movie: Path) -> StackMetadata:
     for path in _beside(movie):
         told = _read(path)
         fresh = {
-            name: value
-            for name, value in vars(told).items()
-            if value is not None and getattr(metadata, name) is None
+            name: value for name, value in told.values.items() if getattr(metadata, name) is None
         }
         if fresh:
             sources = [metadata.source] if metadata.source != "none" else []
@@ -191,14 +174,14 @@ def _beside(movie: Path) -> Iterator[Path]:
             yield path
 
 
-def _read(path: Path) -> Told:
+def _read(path: Path) -> StackMetadata:
     """Read what one text tells; nothing of one that cannot be read."""
     try:
         text = read_text(path, errors="replace")
         if text.lstrip()[:1] in ("{", "["):
             return told_by(dict(_flat(json_of(text))))
     except (OSError, ValueError):
-        return Told()
+        return StackMetadata()
     lines = (line for line in text.splitlines() if len(line) <= _LONGEST_LINE)
     pairs = (match.groups() for line in lines if (match := _LINE.fullmatch(line)))
     return told_by({key: value for (key, value), _ in zip(pairs, range(_MOST_NAMES), strict=False)})

@@ -32,7 +32,14 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import DataError
 from iscat_analysis.hashing import fingerprint, refuse_changed, sha256_of_files, states_of
 from iscat_analysis.movie.addresses import MARK, split_address
-from iscat_analysis.records import BoolArray, FrameSource, InPlace, PlacedSource, StackMetadata
+from iscat_analysis.records import (
+    BoolArray,
+    CountSource,
+    FrameSource,
+    InPlace,
+    PlacedSource,
+    StackMetadata,
+)
 from iscat_analysis.text import printable
 from iscat_analysis.threads import start_in_thread
 
@@ -153,11 +160,6 @@ class ArrayFrames:
                 f"{name}: needs to be frames (t, y, x) of integers or floats but is {stored} of "
                 f"shape {shape}; pass the camera's counts, one frame after the other"
             )
-        if shape[0] < 2:
-            raise DataError(
-                f"{name}: holds a single frame; a movie needs frames before and after a particle "
-                "binds"
-            )
         self._array = array
         self.shape = (shape[0], shape[1], shape[2])
         self.dtype = stored.newbyteorder("=")
@@ -176,6 +178,13 @@ class ArrayFrames:
 
     def close(self) -> None:
         """Leave the array as it is; it belongs to the caller."""
+
+
+def single_frame(name: object) -> DataError:
+    """Make the error of a movie that has one frame."""
+    return DataError(
+        f"{name}: holds a single frame; a movie needs frames before and after a particle binds"
+    )
 
 
 def not_shared(path: Path) -> DataError:
@@ -580,12 +589,17 @@ S = TypeVar("S", bound=FrameSource)
 
 @dataclass(frozen=True, eq=False)
 class ChangedFrames:
-    """Frames of a movie that another one can be made of; how they are read is added to it."""
+    """Wrapper around the frames of a movie, whose subclass overrides `read`."""
 
-    source: Stack
+    source: CountSource
 
     notes: ClassVar[tuple[str, ...]] = ()
     metadata: ClassVar[StackMetadata] = StackMetadata()
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return self.source.name
 
     @property
     def shape(self) -> tuple[int, int, int]:

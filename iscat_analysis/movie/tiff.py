@@ -432,10 +432,6 @@ def _open(
     first = file.pages[order[0]]
     dtype = pixel_type(first, path).newbyteorder(file.byteorder)
     refuse_differences(frames, path)
-    if n_frames < 2 and not member:
-        raise DataError(
-            f"{path}: holds a single frame; a movie needs frames before and after a particle binds"
-        )
     size = math.prod(frames[0].shape) * dtype.itemsize
     for number, image in enumerate(frames):
         if image.start is None:

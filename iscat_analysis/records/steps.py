@@ -229,6 +229,12 @@ class StackMetadata:
     displayed_hz: float | None = None
     source: str = "none"
 
+    @property
+    def values(self) -> dict[str, Any]:
+        """All values that are known, by their names."""
+        known = vars(self).items()
+        return {name: value for name, value in known if name != "source" and value is not None}
+
 
 class FrameSource(Protocol):
     """A movie that is read a few frames at a time."""
