@@ -10,7 +10,7 @@ from typing import Any, Literal
 import panel as pn
 
 import iscat_analysis as ia
-from iscat_analysis.movie import SUFFIXES, holds_single_frames, path_beside
+from iscat_analysis.movie import is_named_as_movie, path_beside
 from iscat_analysis.reading import read_json
 from iscat_analysis.report.answer import answer_in
 from iscat_app.chosen import Chosen, Notice, in_line, table_of
@@ -42,7 +42,7 @@ def listed(folder: Path) -> list[Entry]:
         ending = path.suffix.lower()
         if path.is_dir() and ending == ".iscat":
             continue  # shown with its movie, or below
-        if ending in SUFFIXES or (path.is_dir() and holds_single_frames(path)):
+        if is_named_as_movie(path):
             done = (path_beside(path, ".iscat") / "summary.json").is_file()
             entries.append(Entry(path, "movie", f"{'●' if done else '○'} {path.name}"))
         elif path.is_dir():

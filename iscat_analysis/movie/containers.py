@@ -29,15 +29,18 @@ import numpy as np
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
-from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, refuse_growth
+from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, damaged, refuse_growth
 from iscat_analysis.movie.plain import COLUMNS_TOGETHER, Axes, MappedFrames, as_frames, read_header
 from iscat_analysis.movie.stack import ArrayFrames, Frames
-from iscat_analysis.reading import first_line, open_regular
+from iscat_analysis.reading import open_regular
 from iscat_analysis.records import StackMetadata
 from iscat_analysis.scratch import Scratch
 
 SHOWN_NAMES = 5
 """Names of arrays in a message."""
+
+
+_OF_ARCHIVES = (zipfile.BadZipFile, zlib.error, EOFError)
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,11 @@ ReadMembers = Callable[[BinaryIO, Path], Mapping[str, Member | str]]
 def open_member(path: Path, part: str, *, read: ReadMembers, kind: str) -> Frames:
     """Open the array that is named, or the only one of frames."""
     with open_regular(path) as file:
-        try:
+        what, remedy = (
+            f"{path}: begins like {kind} but is damaged",
+            "copy it again or save it again",
+        )
+        with damaged(what, *_OF_ARCHIVES, remedy=remedy):
             members = read(file, path)
             if not members:
                 raise DataError(f"{path}: is {kind} that holds no array; export the movie as TIFF")
@@ -88,13 +95,6 @@ def open_member(path: Path, part: str, *, read: ReadMembers, kind: str) -> Frame
             alone = part or len(members) == 1
             notes = () if alone else (f"its frames are those of the array {name}",)
             return _frames(member, f"{path}{MARK}{name}", path, notes)
-        except DataError:
-            raise
-        except (zipfile.BadZipFile, zlib.error, EOFError, *WHAT_LIBRARIES_RAISE) as error:
-            raise DataError(
-                f"{path}: begins like {kind} but is damaged ({first_line(error)}); copy it again "
-                "or save it again"
-            ) from None
 
 
 def holds_one(path: Path, *, read: ReadMembers) -> bool:
@@ -102,7 +102,7 @@ def holds_one(path: Path, *, read: ReadMembers) -> bool:
     try:
         with open_regular(path) as file:
             return sum(isinstance(held, Member) for held in read(file, path).values()) == 1
-    except (DataError, zipfile.BadZipFile, zlib.error, EOFError, *WHAT_LIBRARIES_RAISE):
+    except (DataError, *_OF_ARCHIVES, *WHAT_LIBRARIES_RAISE):
         return True
 
 

@@ -12,8 +12,8 @@ from __future__ import annotations
 import math
 import mmap
 import struct
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.mapped import (
-    WHAT_LIBRARIES_RAISE,
     Writer,
+    damaged,
     map_file,
     refuse_changed,
     refuse_growth,
@@ -109,7 +109,8 @@ class StoredArray:
     def _decode(self, number: int) -> NDArray[Any]:
         start, size, left_out = self._where[number].tolist()
         raw = self._data[start : start + size]
-        try:
+        what = f"{self._path}: chunk {number} of {self._name} cannot be decompressed"
+        with damaged(what, remedy="copy the file again or export it again"):
             for position in reversed(range(len(self._filters))):
                 if left_out >> position & 1:
                     continue
@@ -118,11 +119,6 @@ class StoredArray:
                 else:
                     raw = bytes(_CODECS[self._filters[position]](raw, out=self._chunk_bytes))
             return np.frombuffer(raw, self._stored).reshape(self._chunk)
-        except WHAT_LIBRARIES_RAISE as error:
-            raise DataError(
-                f"{self._path}: chunk {number} of {self._name} cannot be decompressed "
-                f"({str(error) or type(error).__name__}); copy the file again or export it again"
-            ) from None
 
 
 class Hdf5Reader:
@@ -220,16 +216,8 @@ class Hdf5Reader:
                 return None
             return [int(value) for value in dataset.attrs[key]]
 
-    @contextmanager
-    def _believing_nothing(self) -> Iterator[None]:
-        try:
-            yield
-        except WHAT_LIBRARIES_RAISE as error:
-            reason = next(iter(str(error).splitlines()), "") or type(error).__name__
-            raise DataError(
-                f"{self._path}: begins like an HDF5 file but is damaged ({reason}); "
-                "copy it again or export it again"
-            ) from None
+    def _believing_nothing(self) -> AbstractContextManager[None]:
+        return damaged(f"{self._path}: begins like an HDF5 file but is damaged")
 
     def _find(self, name: str) -> h5py.Group | h5py.Dataset | None:
         """Walk a path link by link: a name that leads out of the file must never be followed."""

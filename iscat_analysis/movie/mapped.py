@@ -5,7 +5,8 @@ from __future__ import annotations
 import mmap
 import os
 import struct
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.reading import open_regular
+from iscat_analysis.reading import first_line, open_regular
 from iscat_analysis.records import InPlace
 
 WHAT_LIBRARIES_RAISE = (
@@ -23,6 +24,21 @@ WHAT_LIBRARIES_RAISE = (
     AttributeError, AssertionError, SystemError, struct.error,
 )  # fmt: skip
 """What a damaged file makes tifffile, h5py and imagecodecs raise."""
+
+
+@contextmanager
+def damaged(
+    what: str, *errors: type[Exception], remedy: str = "copy it again or export it again"
+) -> Iterator[None]:
+    """Turn what libraries raise on damaged files, and further errors, into one clear line."""
+    caught: tuple[type[Exception], ...] = (*WHAT_LIBRARIES_RAISE, *errors)
+    try:
+        yield
+    except DataError:
+        raise
+    except caught as error:
+        raise DataError(f"{what} ({first_line(error)}); {remedy}") from None
+
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """How HDF5 files begin."""

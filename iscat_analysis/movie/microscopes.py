@@ -27,8 +27,7 @@ from iscat_analysis.movie.descriptions import (
     positive,
     time_axis,
 )
-from iscat_analysis.movie.mapped import refuse_growth
-from iscat_analysis.reading import first_line
+from iscat_analysis.movie.mapped import damaged, refuse_growth
 from iscat_analysis.records import StackMetadata
 
 _CZI_TYPES = {"Gray8": "u1", "Gray16": "u2", "Gray32": "u4", "Gray32Float": "f4"}
@@ -194,14 +193,7 @@ def _of(value: Any, *steps: str | int) -> Any:
 
 @contextmanager
 def _believing_nothing(path: Path, what: str) -> Iterator[None]:
-    """Turn whatever a package raises into one line."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    except DataError:
-        raise
-    except Exception as error:
-        raise DataError(
-            f"{path}: {what} ({first_line(error)}); copy it again or export it again"
-        ) from None
+    """Turn whatever a package raises into one line, and what it warns of into nothing."""
+    with damaged(f"{path}: {what}", Exception), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield

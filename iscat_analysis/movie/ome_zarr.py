@@ -32,9 +32,9 @@ from zarr.storage import LocalStore
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
 from iscat_analysis.movie.descriptions import LENGTH_NM, TIME_S, Hints, inverse, merge, positive
-from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, refuse_growth
+from iscat_analysis.movie.mapped import damaged, refuse_growth
 from iscat_analysis.movie.stack import ArrayFrames
-from iscat_analysis.reading import LARGEST_TEXT_BYTES, first_line
+from iscat_analysis.reading import LARGEST_TEXT_BYTES
 from iscat_analysis.records import StackMetadata
 
 _TEXTS = ("zarr.json", ".zgroup", ".zarray", ".zattrs", ".zmetadata")
@@ -97,15 +97,9 @@ class CheckedArray:
         store.complete = True
 
     def __getitem__(self, key: slice, /) -> NDArray[Any]:
-        try:
+        what = f"{self._name}: frames {key.start} to {key.stop - 1} cannot be decompressed"
+        with damaged(what, remedy="copy the movie again or export it again"):
             return np.asarray(self._array[key]).reshape(-1, *self.shape[1:])
-        except DataError:
-            raise
-        except WHAT_LIBRARIES_RAISE as error:
-            raise DataError(
-                f"{self._name}: frames {key.start} to {key.stop - 1} cannot be decompressed "
-                f"({first_line(error)}); copy the movie again or export it again"
-            ) from None
 
 
 def _sizes(folder: Path) -> dict[str, int]:
@@ -191,21 +185,15 @@ def open_zarr(folder: Path, part: str) -> ArrayFrames:
     """Open a movie in a Zarr folder."""
     name = f"{folder}{MARK}{part}" if part else str(folder)
     store = CheckedStore(folder)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of files that are none of Zarr's
-            node = zarr.open(store, mode="r", path=part.strip("/") or None)
-            if hasattr(node, "dtype"):
-                array, metadata = node, StackMetadata()
-            else:
-                array, metadata = _of_group(node, name)
+    what = f"{name}: cannot be read as Zarr"
+    with damaged(what, remedy="export it again"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of files that are none of Zarr's
+        node = zarr.open(store, mode="r", path=part.strip("/") or None)
+        if hasattr(node, "dtype"):
+            array, metadata = node, StackMetadata()
+        else:
+            array, metadata = _of_group(node, name)
         checked = CheckedArray(array, store, name)
-    except DataError:
-        raise
-    except WHAT_LIBRARIES_RAISE as error:
-        raise DataError(
-            f"{name}: cannot be read as Zarr ({first_line(error)}); export it again"
-        ) from None
     return ArrayFrames(checked, name, metadata)
 
 

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK, Layout, layout
 from iscat_analysis.movie.mapped import (
-    WHAT_LIBRARIES_RAISE,
+    damaged,
     frames_in_place,
     map_file,
     refuse_changed,
@@ -44,7 +44,7 @@ from iscat_analysis.movie.mapped import (
     unmap,
 )
 from iscat_analysis.movie.stack import FileSet, single_frame
-from iscat_analysis.reading import first_line, is_file, open_regular, read_text
+from iscat_analysis.reading import is_file, open_regular, read_text
 from iscat_analysis.records import InPlace, StackMetadata
 
 _LEAST_BYTE_GAIN = 8.0  # of the smoothness, if bytes are swapped; 3 for the noisiest real movies
@@ -186,16 +186,13 @@ class Header(NamedTuple):
 
 def read_header(file: IO[bytes], path: Path) -> Header:
     """Read what comes before the numbers of an array, and not more."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of headers that Python 2 wrote, which are read
-            version = npy.read_magic(file)
-            shape, last_first, stored = _HEADERS[version](file)
-            offset = file.tell()
-    except (SyntaxError, tokenize.TokenError, *WHAT_LIBRARIES_RAISE) as error:
-        raise DataError(
-            f"{path}: begins like a NumPy array but is damaged ({first_line(error)}); save it again"
-        ) from None
+    what = f"{path}: begins like a NumPy array but is damaged"
+    errors = SyntaxError, tokenize.TokenError
+    with damaged(what, *errors, remedy="save it again"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of headers that Python 2 wrote, which are read
+        version = npy.read_magic(file)
+        shape, last_first, stored = _HEADERS[version](file)
+        offset = file.tell()
     return Header(shape, stored, FRAMES_TOGETHER if last_first else ROWS_TOGETHER, offset)
 
 

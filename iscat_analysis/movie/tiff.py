@@ -48,6 +48,7 @@ from iscat_analysis.movie.descriptions import (
 )
 from iscat_analysis.movie.mapped import (
     WHAT_LIBRARIES_RAISE,
+    damaged,
     frames_in_place,
     map_file,
     refuse_changed,
@@ -98,7 +99,7 @@ class Image:
 def refuse_overlap(values: int, data: mmap.mmap, path: Path) -> None:
     """Refuse images that share one long value, which would cost its length each time."""
     if values > _OVERLAP * len(data) + _OVERLAP_BYTES:
-        raise damaged(path, "the headers of its images overlap")
+        raise _damaged(path, "the headers of its images overlap")
 
 
 def refuse_unread_pixels(page: tifffile.TiffPage, file_size: int, path: Path) -> None:
@@ -106,14 +107,14 @@ def refuse_unread_pixels(page: tifffile.TiffPage, file_size: int, path: Path) ->
     number, rows, columns = page.index, page.imagelength, page.imagewidth
     frame_bytes = rows * columns * (page.dtype.itemsize if page.dtype else 8) * page.samplesperpixel
     if not 0 < frame_bytes <= _LARGEST_FRAME_BYTES:
-        raise damaged(path, f"image {number} declares {rows} x {columns} pixels")
+        raise _damaged(path, f"image {number} declares {rows} x {columns} pixels")
     needed = math.prod(page.chunked)
     tag = page.tags.get(TILE_OFFSETS) or page.tags.get(STRIP_OFFSETS)
     listed = tag.count if tag is not None else 0
     if page.compression != 1 and not {STRIP_SIZES, TILE_SIZES} & set(page.tags.keys()):
-        raise damaged(path, f"image {number} does not say how long its pixel data are")
+        raise _damaged(path, f"image {number} does not say how long its pixel data are")
     if not listed == len(page.dataoffsets) == len(page.databytecounts) == needed:
-        raise damaged(path, f"image {number} lists {listed} strips or tiles but needs {needed}")
+        raise _damaged(path, f"image {number} lists {listed} strips or tiles but needs {needed}")
     if min(page.dataoffsets) <= 0 or min(page.databytecounts) <= 0:
         raise DataError(
             f"{path}: image {number} has no pixel data for part of its area; "
@@ -131,7 +132,7 @@ def refuse_unread_pixels(page: tifffile.TiffPage, file_size: int, path: Path) ->
         if page.is_tiled and page.samplesperpixel == 1:
             rows, columns = needed * tile_rows, tile_columns
         if stored < rows * -(-columns * page.bitspersample // 8):
-            raise damaged(path, f"image {number} needs more than the {stored} bytes it stores")
+            raise _damaged(path, f"image {number} needs more than the {stored} bytes it stores")
 
 
 def refuse_volumes(page: tifffile.TiffPage, path: Path) -> None:
@@ -178,7 +179,7 @@ def refuse_differences(frames: Sequence[Image], path: Path) -> None:
             )
 
 
-def damaged(path: Path, how: str) -> DataError:
+def _damaged(path: Path, how: str) -> DataError:
     """Make the error of a damaged file."""
     return DataError(f"{path}: is damaged ({how}); export it again")
 
@@ -343,34 +344,24 @@ class TiffFrames:
     def _decode_into(self, frame: NDArray[Any], image: Image, number: int) -> None:
         rows, columns = frame.shape
         for segment, (offset, size) in enumerate(zip(image.offsets, image.sizes, strict=True)):
-            try:
+            what = f"{self._path}: the pixels of frame {number} cannot be decompressed"
+            with damaged(what, remedy="copy the file again or export it again"):
                 pixels, place, _ = self._decode(self._data[offset : offset + size], segment)
                 top, left = place[2], place[3]
                 tile = pixels[0, : rows - top, : columns - left, 0]
                 frame[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
-            except WHAT_LIBRARIES_RAISE as error:
-                raise DataError(
-                    f"{self._path}: the pixels of frame {number} cannot be decompressed "
-                    f"({error or type(error).__name__}); copy the file again or export it again"
-                ) from None
 
 
 def open_tiff(path: Path, *, member: bool = False) -> TiffFrames | FileSet:
     """Open a TIFF movie."""
     data = map_file(path)
     try:
-        with _unheard(), tifffile.TiffFile(path, **_PLAIN) as file:
+        what = f"{path}: is truncated or damaged ({len(data)} bytes long)"
+        with damaged(what), _unheard(), tifffile.TiffFile(path, **_PLAIN) as file:
             return _open(file, data, path, member)
     except DataError:
         data.close()
         raise
-    except WHAT_LIBRARIES_RAISE as error:
-        size = len(data)
-        data.close()
-        raise DataError(
-            f"{path}: is truncated or damaged ({_first_line(error)}; it is {size} bytes long); "
-            "copy it again or export it again"
-        ) from None
 
 
 @contextmanager
@@ -487,11 +478,11 @@ def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[Im
         except IndexError:
             break
         if page.offset in seen:
-            raise damaged(path, f"its list of frames runs in a circle after {number}")
+            raise _damaged(path, f"its list of frames runs in a circle after {number}")
         seen.add(page.offset)
         tags, following = _declared_tags(file.tiff, data, page.offset)
         if len(tags) != len(page.tags) and set(tags) & _ESSENTIAL - set(page.tags.keys()):
-            raise damaged(path, f"the header of image {number} is truncated or cannot be read")
+            raise _damaged(path, f"the header of image {number} is truncated or cannot be read")
         long_values = sum(tag.valuebytecount for tag in page.tags if tag.count > _INLINE)
         values += long_values
         refuse_overlap(values, data, path)
@@ -617,10 +608,6 @@ def _unheard() -> Iterator[None]:
         yield
     finally:
         logger.removeHandler(handler)
-
-
-def _first_line(error: BaseException) -> str:
-    return next(iter(str(error).splitlines()), "") or type(error).__name__
 
 
 def open_set(described: OmeSet, path: Path, open_member: Callable[[Path], Frames]) -> FileSet:
