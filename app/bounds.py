@@ -15,7 +15,6 @@ import iscat_analysis as ia
 from iscat_app.chosen import Chosen, Notice, table_of
 
 _PIXELS = 61
-_PIXEL_NM = 84.4  # where nobody said
 _KINDS = {"crb_single": "CRB, alone", "crb_joint": "CRB, together", "qcrb": "QCRB"}
 _KEYS = {"x_nm": "x [nm]", "y_nm": "y [nm]", "z_nm": "z [nm]", "mass_kda": "mass [kDa]"}
 
@@ -93,7 +92,7 @@ class Bounds:
         frames = int(settings["bounds.n_after"])
         settings |= {"bounds.n_after": frames, "bounds.n_before": frames}
         if self._config is None or self._config.camera.pixel_size_nm is None:
-            settings["camera.pixel_size_nm"] = _PIXEL_NM
+            settings["camera.pixel_size_nm"] = 84.4  # where nobody said
         return settings
 
     def _show(self, computed: tuple[ia.Bounds, np.ndarray[Any, Any], float]) -> None:

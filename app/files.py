@@ -17,12 +17,6 @@ from iscat_app.chosen import Chosen, Notice, in_line, table_of
 
 Kind = Literal["folder", "movie", "result"]
 
-LARGEST_UPLOAD_MB = 200
-"""Of a file that is dropped on the page; larger ones are opened where they lie."""
-
-_MB = 1e6
-_SHOWN = 18  # lines of the list
-
 
 @dataclass(frozen=True)
 class Entry:
@@ -61,7 +55,7 @@ def facts_of(movie: Path) -> list[tuple[str, str]]:
         told = stack.metadata
         facts = [
             ("frames", f"{frames} of {rows} × {columns} pixels, {stack.dtype}"),
-            ("size", f"{frames * rows * columns * stack.dtype.itemsize / _MB:.4g} MB of pixels"),
+            ("size", f"{frames * rows * columns * stack.dtype.itemsize / 1e6:.4g} MB of pixels"),
         ]
         for name, label, unit in (
             ("pixel_size_nm", "pixel", "nm"),
@@ -102,14 +96,15 @@ class Files:
         # Of many, since a list of one sends its first line where nothing is chosen.
         self._list = pn.widgets.MultiSelect(
             label="Movies (● analysed, ○ not yet), ◆ results, ▸ folders",
-            size=_SHOWN,
+            size=18,  # lines of the list
             sizing_mode="stretch_width",
         )
         self._facts = pn.pane.HTML("", sizing_mode="stretch_width")
         again = pn.widgets.Button(label="Look again", width=100)
         again.on_click(lambda _: self.refresh())
         self._drop = pn.widgets.FileDropper(
-            label="Copy a small movie here", multiple=True, max_file_size=f"{LARGEST_UPLOAD_MB}MB",
+            # Of a file that is dropped on the page; larger ones are opened where they lie
+            label="Copy a small movie here", multiple=True, max_file_size="200MB",
             sizing_mode="stretch_width", height=90,
         )  # fmt: skip
         self._where.param.watch(self._go, "value")

@@ -28,14 +28,6 @@ from iscat_app.chosen import Chosen, Notice
 RATES = (5, 10, 25, 50, 100, 250, 1000)
 """Frames of the movie per second."""
 
-AHEAD = 2
-"""Pictures on their way to the browser at most."""
-
-SLIDER_S = 0.25
-"""After which the slider of frames follows the film, as it plays."""
-
-FIRST_WINDOW = 25
-"""Frames of the window before anyone has chosen."""
 
 _LANDS, _LEAVES, _DOUBTFUL, _HERE = "#56B4E9", "#CC79A7", "#E69F00", "#F0E442"
 _SIDE_PX = 560
@@ -210,7 +202,8 @@ class Film:
             if isinstance(offset, str):  # measured, or a map
                 offset = stack.metadata.offset_adu
             self._film = RatioFilm(stack, offset_adu=offset or 0.0)
-            self._film.window = min(FIRST_WINDOW, self._film.longest)
+            # Frames of the window before anyone has chosen
+            self._film.window = min(25, self._film.longest)
         except ia.IscatError:
             stack.close()
             raise
@@ -262,7 +255,8 @@ class Film:
         """Show the next frame when it is time for it."""
         document = pn.state.curdoc
         ahead = self._sent - max(self._drawn.value, self._begun)
-        if document is not None and not self._due and ahead < AHEAD:
+        # Pictures on their way to the browser at most
+        if document is not None and not self._due and ahead < 2:
             self._due = True
             left = 1.0 / self.rate.value - (time.monotonic() - self._ticked)
             document.add_timeout_callback(self._step, max(1, round(1000 * left)))
@@ -279,7 +273,8 @@ class Film:
         if not first <= self._next < stop:
             self._next = float(first)
         self._at = math.floor(self._next)
-        if now - self._slid > SLIDER_S:
+        # After which the slider of frames follows the film, as it plays
+        if now - self._slid > 0.25:
             self._slid = now
             self._shown_by_player(self._at)
         self._show()

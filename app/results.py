@@ -33,8 +33,6 @@ from iscat_app.chosen import Chosen, Notice, in_line, link_to, masses_in, table_
 COLUMNS = ("event", "frame", "x_px", "y_px", "mass_kda", "rejected_at")
 """Columns of the list: what the event was, so that a new analysis does not reject another."""
 
-_NEAR_PX = 1.0
-
 
 class Rejections:
     """The rejected events of one result."""
@@ -57,7 +55,7 @@ class Rejections:
         for row in self.rows.to_dict("records"):
             if row["event"] in known.index:
                 now = known.loc[row["event"]]
-                near = abs(now["x_px"] - row["x_px"]) + abs(now["y_px"] - row["y_px"]) < _NEAR_PX
+                near = abs(now["x_px"] - row["x_px"]) + abs(now["y_px"] - row["y_px"]) < 1.0
                 if near and now["frame"] == row["frame"]:
                     found.add(int(row["event"]))
         return found
@@ -86,7 +84,6 @@ class Rejections:
 
 
 _BLUE, _GREY, _RED = "#0072B2", "#8A8F96", "#D55E00"
-_LEFT_PX = 660
 _BRANCHES: dict[str, Branch] = {
     "landing and leaving": "magnitude",
     "landing": "landing",
@@ -241,7 +238,7 @@ class Results:
                     self._gate_table,
                     self._species_table,
                     pn.Row(pn.pane.Bokeh(self._map), pn.pane.Bokeh(self._course)),
-                    width=_LEFT_PX,
+                    width=660,
                 ),
                 pn.Column(self.which, reject, self._facts, self._picture, self.listed, back),
             ),

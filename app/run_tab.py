@@ -13,9 +13,6 @@ from iscat_app.chosen import Chosen, Notice, in_line
 from iscat_app.files import listed
 from iscat_app.runs import Job, Queue, Run
 
-LOOK_MS = 500
-"""Between two looks at the queue."""
-
 
 class RunTab:
     """Shows the queue, which belongs to all pages."""
@@ -57,7 +54,7 @@ class RunTab:
     def watch(self) -> None:
         """Look at the queue now and then, whichever tab is open."""
         self._ended = {run.number for run in self._queue.runs if run.ended}
-        pn.state.add_periodic_callback(self._look, period=LOOK_MS)
+        pn.state.add_periodic_callback(self._look, period=500)  # between two looks at the queue
 
     def refresh(self) -> None:
         """Show the queue as it is."""

@@ -25,12 +25,6 @@ if TYPE_CHECKING:
 
 State = Literal["waiting", "running", "stopping", "done", "stopped", "failed"]
 
-LOG_LINES = 200
-"""Lines of a run that are kept."""
-
-CLOSING_S = 1.0
-"""That a run has to end by itself when the server ends; finished parts are on the disk by then."""
-
 
 Kind = Literal["fit", "camera", "optics", "day"]
 """What is done with a movie, or with a folder of them: the command of that name."""
@@ -99,7 +93,7 @@ class Run:
 
     def say(self, text: str) -> None:
         """Keep a line for the log."""
-        self.log = [*self.log, text][-LOG_LINES:]
+        self.log = [*self.log, text][-200:]  # lines of a run that are kept
 
 
 class Queue:
@@ -148,7 +142,9 @@ class Queue:
             self._wake.notify_all()
         if process is not None and process.is_alive() and process.pid:
             os.kill(process.pid, signal.SIGINT)
-            process.join(CLOSING_S)
+            # That a run has to end by itself when the server ends; finished parts are on the disk
+            # by then
+            process.join(1.0)
             if process.is_alive():
                 process.terminate()
 

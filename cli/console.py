@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 UNEXPECTED = 1
 SECONDS_TO_FIRST_LINE = 2.0
-SECONDS_BETWEEN_LINES = 10.0
-PLAIN_WIDTH = 200
 
 
 class _Console(Console):
@@ -185,7 +183,7 @@ class _Lines:
             if done < total:
                 if now < self._due:
                     return
-                self._due = now + SECONDS_BETWEEN_LINES
+                self._due = now + 10.0
                 begun, known = self._first
                 if done > known:
                     left = (now - begun) * (total - done) / (done - known)
@@ -329,7 +327,7 @@ def print_result(result: RenderableType) -> None:
     """Print a result on stdout: in colour on a terminal, as plain text elsewhere."""
     console = _Console()
     if not console.is_terminal:
-        console = _Console(width=PLAIN_WIDTH, no_color=True)
+        console = _Console(width=200, no_color=True)
     with _failing_once(sys.stdout), console.capture() as captured:
         console.print(result, soft_wrap=isinstance(result, str))
     _write(sys.stdout, "".join(f"{line.rstrip()}\n" for line in captured.get().splitlines()))

@@ -21,8 +21,6 @@ GRACE_S = 1.5
 WRITING_GRACE_S = 30.0
 """The same while results are being written, which a second signal cuts short."""
 
-_LOOK_S = 0.05  # between two looks at what has become of an interrupt
-
 
 class Interrupts:
     """Interrupts the main thread when a signal asks the command to end, and sees that it ends.
@@ -98,7 +96,7 @@ class Interrupts:
     def _ends_in_time(self) -> bool:
         """Tell whether the command ends within the time that it has."""
         begun = time.monotonic()
-        while not self._ended.wait(_LOOK_S):
+        while not self._ended.wait(0.05):  # between two looks at what has become of an interrupt
             if self._swallowed:
                 self._swallowed = False
                 self._interrupt_main()

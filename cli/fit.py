@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from iscat_analysis.records import Analysis
 
-FLAGGED = 3
 ROWS_SHOWN = 20
 GAP = 3  # characters between the columns of a table on a terminal
 
@@ -176,7 +175,7 @@ def fit(
     if strict is not None and (
         flagged or understated or codes & {finding.code for finding in analysis.findings}
     ):
-        raise typer.Exit(FLAGGED)
+        raise typer.Exit(3)  # something is flagged
 
 
 def _codes(strict: str | None) -> frozenset[str]:

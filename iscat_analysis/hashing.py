@@ -10,8 +10,6 @@ from pathlib import Path
 from iscat_analysis.errors import DataError
 
 _BLOCK_BYTES = 2**24  # of a file, that are in memory at a time
-_END_BYTES = 2**20  # that a fingerprint reads of a file; many files share them
-_LEAST_END_BYTES = 2**8
 
 
 def sha256_of_files(files: Sequence[Path], part: str = "") -> str:
@@ -53,7 +51,8 @@ def refuse_changed(files: Sequence[Path], states: Sequence[tuple[int, ...]]) -> 
 
 def fingerprint(files: Sequence[Path], part: str = "") -> str:
     """Tell a movie's content from another's without reading all of it."""
-    end = max(_END_BYTES // max(len(files), 1), _LEAST_END_BYTES)
+    # Bytes that a fingerprint reads at either end of a file; many files share them
+    end = max(2**20 // max(len(files), 1), 2**8)
     digest = hashlib.sha256(part.encode("utf-8", "backslashreplace"))
     for path in files:
         with path.open("rb") as file:

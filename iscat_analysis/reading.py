@@ -36,7 +36,6 @@ _OF_DAMAGE = (
     RuntimeError, ArithmeticError, tokenize.TokenError, struct.error,
 )  # fmt: skip
 _FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-_LONGEST_LINE = 200  # characters of what a library says
 _MOST_DOTS = 64  # of a key; tomllib takes the square of their number
 _DOT = re.compile(r"(?<!\.)\.(?!\.)")
 
@@ -131,7 +130,7 @@ def npz_of(content: bytes, names: Sequence[str], most: int) -> dict[str, NDArray
 def first_line(error: BaseException) -> str:
     """Give the first line of what an error says, and no more than a line holds."""
     line = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
-    return line[:_LONGEST_LINE] or type(error).__name__
+    return line[:200] or type(error).__name__  # characters of what a library says
 
 
 def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFrame:

@@ -8,10 +8,8 @@ from collections.abc import Iterable
 NM = 1e-9
 """One nanometre in metres."""
 
-DALTON_KG = 1.66053906892e-27
-"""One dalton in kilograms (CODATA 2022)."""
 
-KILODALTON_KG = 1e3 * DALTON_KG
+KILODALTON_KG = 1e3 * 1.66053906892e-27  # one dalton in kilograms (CODATA 2022)
 """One kilodalton in kilograms."""
 
 

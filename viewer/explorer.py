@@ -76,7 +76,6 @@ LEAST_THRESHOLD, MOST_THRESHOLD = 2.0, 20.0
 """Signal-to-noise ratios that can be chosen."""
 
 _SPOT_PX, _THIN = 12.0, 0.06  # side of the mark, and its line's share of it
-_SOON_MS = 30  # after which the search follows the slider of frames
 _LANDS, _LEAVES = "yellow", "deepskyblue"
 
 
@@ -132,7 +131,7 @@ class Explorer(QWidget):
 
         self._soon = QTimer(self)
         self._soon.setSingleShot(True)
-        self._soon.setInterval(_SOON_MS)
+        self._soon.setInterval(30)  # after which the search follows the slider of frames
         self._soon.timeout.connect(self.detect)
         browse.clicked.connect(self._browse)
         self.movie.currentIndexChanged.connect(self._search_soon)

@@ -78,7 +78,6 @@ LayerData = tuple[Any, dict[str, Any], str]
 RESULT, ROW = "iscat_result", "row"
 """Key of a layer's metadata that holds the `StoredResult`, and the feature with its table's row."""
 
-_SIZE_PX = 12.0
 
 _COLOURS = {Status.OK.value: "lime"}
 _DOUBTFUL = "orange"
@@ -134,7 +133,7 @@ def result_layers(result: StoredResult) -> list[LayerData]:
         "face_color": "transparent",
         "border_color": [_COLOURS.get(str(status), _DOUBTFUL) for status in placed["status"]]
         or "lime",
-        "size": _SIZE_PX,
+        "size": 12.0,
         "border_width": 0.06,
         "scale": scale,
         "metadata": {RESULT: result},

@@ -23,14 +23,9 @@ from iscat_analysis.config.values import (
     length,
 )
 
-LOWEST_VISCOSITY_MPA_S = 0.1
-"""Half the viscosity of ether, the thinnest liquid near room temperature."""
-
 DIAMETERS_NM = (2.0, 2000.0)
 """Range of diameters of the spheres that mode size may search."""
 
-MOST_SPHERES = 32
-"""Materials of spheres that are tried, at most."""
 
 TEMPERATURES_C = (-100.0, 250.0)
 """Temperatures of liquids in a microscope; the upper end is below their values in kelvin."""
@@ -154,7 +149,8 @@ class Fit(Section):
         Annotated[Positive, length(*DIAMETERS_NM)], Annotated[Positive, length(*DIAMETERS_NM)]
     ] = (10.0, 400.0)
     """bounds of the diameter in mode size, and of spheres"""
-    spheres: Annotated[tuple[SphereKind, ...], Field(max_length=MOST_SPHERES)] = (
+    # Materials of spheres that are tried, at most
+    spheres: Annotated[tuple[SphereKind, ...], Field(max_length=32)] = (
         "vesicle",
         "gold",
         "silica",
@@ -204,7 +200,7 @@ class Fit(Section):
 
 
 def _no_pascal_seconds(viscosity: float) -> float:
-    if viscosity < LOWEST_VISCOSITY_MPA_S:
+    if viscosity < 0.1:  # half the viscosity of ether, the thinnest liquid near room temperature
         raise ValueError(
             f"{viscosity:g} mPa·s is less than any liquid has; if {viscosity:g} is in Pa·s, write "
             f"{1e3 * viscosity:g}"

@@ -31,7 +31,6 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.reading import LARGEST_TEMPLATE_BYTES, read_bytes, read_text, toml_of
 from iscat_analysis.text import in_toml
 
-_LEAST_SIMILARITY = 0.7  # of two words, as difflib measures it
 _DECIMAL_COMMA = re.compile(r"\s*([-+]?\d+),(\d+)\s*")
 
 
@@ -92,7 +91,8 @@ def _nearest(word: str, location: list[str]) -> str:
     ]
     if sections and len(location) < 2:
         return " or ".join(f"{section}.{small}" for section in sections)
-    near = difflib.get_close_matches(small, list(known), n=1, cutoff=_LEAST_SIMILARITY)
+    # The least similarity of two words, as difflib measures it
+    near = difflib.get_close_matches(small, list(known), n=1, cutoff=0.7)
     return known[near[0]] if near else ""
 
 

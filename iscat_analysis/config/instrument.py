@@ -191,18 +191,6 @@ DENSITIES_KG_M3 = {"gold": 19300.0, "silica": 2200.0, "polystyrene": 1050.0, "pr
 USUAL_HEIGHT_NM = 5.0
 """Height of a protein on glass, at which masses are calibrated by default."""
 
-UNKNOWN_SD_NM = 20.0
-"""Standard deviation of heights before they are learned from a movie: a tenth of a fringe."""
-
-TYPICAL_DIAMETER_NM = 30.0
-"""Diameter of a particle if none is given, unless it is a protein."""
-
-TYPICAL_SPHERE_NM = 100.0
-"""Diameter of a sphere that is not small beside the wavelength, if none is given."""
-
-TYPICAL_PROTEIN_KDA = 150.0
-"""Mass of a protein if none is given."""
-
 
 def _noll_names(terms: dict[str, float]) -> dict[str, float]:
     for name in terms:
@@ -520,8 +508,10 @@ class Particle(Section):
         if self.mass_kda is not None:
             return self.mass_kda
         if self.diameter_nm is None and self.kind == "protein" and not self.is_sphere:
-            return TYPICAL_PROTEIN_KDA
-        typical = TYPICAL_SPHERE_NM if self.is_sphere else TYPICAL_DIAMETER_NM
+            return 150.0  # mass of a protein if none is given
+        # Diameter of a particle if none is given, unless it is a protein
+        # Diameter of a sphere that is not small beside the wavelength, if none is given
+        typical = 100.0 if self.is_sphere else 30.0
         return sphere_mass_kda(self.diameter_nm or typical, self.density)
 
     @property
@@ -608,4 +598,5 @@ class Particle(Section):
     @property
     def height_prior_sd_nm(self) -> float:
         """Standard deviation of the prior of heights; wide before they are learned from a movie."""
-        return self.height_sd_nm or (UNKNOWN_SD_NM if self.height_is_open else 0.0)
+        # Standard deviation of heights before they are learned from a movie: a tenth of a fringe
+        return self.height_sd_nm or (20.0 if self.height_is_open else 0.0)

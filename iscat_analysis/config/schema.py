@@ -222,13 +222,6 @@ INVISIBLE = 1e-3
 is not seen."""
 
 
-ROD_PER_WAVE = 1 / 8
-"""Longest rod over the wavelength in the sample.
-
-The light that the two halves of an upright rod scatter back is out of phase by then, and the rod
-scatters 6 % less than its dipole, (k L)²/10."""
-
-
 def _known_of_dipoles(config: Config) -> str:
     """Name a setting that the models of spheres and rods do not have; nothing if none is set."""
     particle, optics = config.particle, config.optics
@@ -268,7 +261,10 @@ def rod_refusal(config: Config) -> str:
         )
     if unseen := _unseen(optics, particle.given_index):
         return unseen
-    longest = optics.wavelength_nm / optics.n_sample * ROD_PER_WAVE
+    # Longest rod over the wavelength in the sample. The light that the two halves of an upright
+    # rod scatter back is out of phase by then, and the rod scatters 6 % less than its dipole, (k
+    # L)²/10
+    longest = optics.wavelength_nm / optics.n_sample / 8
     if particle.nominal_length_nm > longest:
         return (
             f"a rod of particle.aspect_ratio = {particle.aspect_ratio:g} and the volume of a "

@@ -8,9 +8,6 @@ from pydantic import Field, model_validator
 
 from iscat_analysis.config.values import LARGEST_NM, Finite, NonNegative, Positive, Section, length
 
-MOST_FRAMES = 10_000_000
-"""Longest simulated movie; particles that move have positions in all of its frames."""
-
 _MOST_POSITIONS = 100_000_000
 
 
@@ -102,7 +99,8 @@ class Simulation(Section):
         128,
     )
     """rows, columns"""
-    frames: Annotated[int, Field(ge=2, le=MOST_FRAMES)] = 400
+    # Longest simulated movie; particles that move have positions in all of its frames
+    frames: Annotated[int, Field(ge=2, le=10_000_000)] = 400
     """frames in the movie"""
     photons_per_pixel: Positive = 1e4
     """background photoelectrons per pixel and frame; dark field: scattered photons collected per

@@ -17,8 +17,6 @@ from iscat_analysis.units import count, sphere_diameter_nm
 POOR_P = 0.01
 """A p-value that one good fit in 100 has."""
 
-_CHANCE = 1e-4  # that so many fits are poor, below which the model is rejected
-
 
 def make_rows(
     lines: pd.DataFrame | Mapping[str, Any] | Iterable[Mapping[str, Any]],
@@ -129,7 +127,8 @@ def is_rejected(table: pd.DataFrame) -> bool:
         tracks = tracks.sort_values("mean")
         before = tracks["size"].cumsum() - tracks["size"]
         fits, misses = (int(n) for n in tracks.loc[before < fits / 2, ["size", "sum"]].sum())
-    return bool(fits) and float(bdtrc(misses - 1, fits, POOR_P)) <= _CHANCE
+    # The chance that so many fits are poor, below which the model is rejected
+    return bool(fits) and float(bdtrc(misses - 1, fits, POOR_P)) <= 1e-4
 
 
 def species_rows(table: pd.DataFrame) -> tuple[pd.DataFrame, tuple[str, ...]]:
