@@ -247,9 +247,7 @@ def _fit(job: Job, progress: Progress, notify: Callable[[str], None]) -> str:
     from iscat_analysis.pipeline import fit_stack
 
     config = load_config(job.config)
-    with open_executor(
-        job.scheduler, None, shared=job.movie, workers=config.compute.workers
-    ) as executor:
+    with open_executor(job.scheduler) as executor:
         analysis = fit_stack(
             job.movie, config, out=job.out, overwrite=job.overwrite, progress=progress,
             notify=notify, command=job.command, executor=executor,

@@ -135,17 +135,14 @@ def fit(
     from iscat_analysis.executors import open_executor
     from iscat_analysis.movie import MARK
 
-    movie, many = stack, resolved.compute.workers
     if raw is not None:
         stack = Path(f"{stack}{MARK}{raw}")
     folder = output.beside(stack, ".iscat")
     with (
-        open_executor(
-            setup.scheduler, setup.scheduler_file, shared=movie, workers=many
-        ) as executor,
+        open_executor(setup.scheduler, setup.scheduler_file) as executor,
         messages.progress() as progress,
     ):
-        from iscat_analysis.pipeline import fit_stack  # while the second process imports
+        from iscat_analysis.pipeline import fit_stack
 
         analysis = fit_stack(
             stack,

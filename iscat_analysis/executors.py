@@ -1,4 +1,4 @@
-"""Where work runs: in this process, in a second one beside it, or on the workers of a Dask cluster.
+"""Where work runs: in this process, or on the workers of a Dask cluster.
 
 A job is a function at module level whose arguments can be pickled.  Movies of a day are jobs, and
 chunks of a landing movie.  A worker does one job at a time with all of its threads, so that its
@@ -18,20 +18,16 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from contextvars import ContextVar
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from iscat_analysis.errors import ConfigError, DataError, SchedulerError
 from iscat_analysis.reading import read_json
 from iscat_analysis.records import Progress, silent
-from iscat_analysis.second_process import SecondProcess
-from iscat_analysis.threads import allotted, processors
+from iscat_analysis.threads import allotted
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -52,12 +48,6 @@ _BUSY_S = 1.0  # that a job waits where its worker is busy, before it goes to an
 _MOST_AT_ONCE = 1000
 _BASE_MB = 400  # of a process, beside the pixels
 _LIBRARIES = "iscat-analysis[dask]"
-_LARGE_BYTES = 60e6  # of a movie whose job is worth the start of a process
-_IMPORTED = ("iscat_analysis.report.movie_page", "iscat_analysis.landing.chunks")
-_LOST = (
-    "the second process was ended from outside, most likely because memory ran out; its part is "
-    "done again in the first"
-)
 
 _installed = cache(version)  # read from folders, which takes a twentieth of a small run
 
@@ -81,9 +71,6 @@ class Executor(Protocol):
     def distant(self) -> bool:
         """Whether jobs run in other processes, which read movies by their paths."""
 
-    def threads(self, wanted: int, jobs: int) -> int:
-        """Say how many threads this process may use while there are so many jobs."""
-
     def call(
         self,
         job: Callable[..., R],
@@ -102,20 +89,9 @@ class Executor(Protocol):
 
 
 class LocalExecutor:
-    """Runs jobs in this process, one after the other or shared with a second process.
-
-    Results do not depend on which process does a job.  Jobs of a second process that dies are done
-    in this one.
-    """
+    """Runs jobs in this process, one after the other."""
 
     distant = False
-
-    def __init__(self, second: SecondProcess | None = None) -> None:
-        self._second = second
-
-    def threads(self, wanted: int, jobs: int) -> int:
-        """Use as many as are wanted, or half where a second process works; see `Executor`."""
-        return max(1, wanted // 2) if self._second is not None and jobs > 1 else wanted
 
     def call(
         self,
@@ -126,85 +102,17 @@ class LocalExecutor:
         here: Callable[[], R] | None = None,
     ) -> R:
         """Do a job; see `Executor`."""
-        if self._second is not None and _ELSEWHERE.get():
-            return self._second.call(job, *arguments)
         return here() if here is not None else job(*arguments, progress=progress)
 
     def each(self, work: Callable[[T], R], items: Sequence[T]) -> Generator[tuple[int, R]]:
-        """Do something with every item, in order or two at a time; see `Executor`."""
-        waiting = deque(enumerate(items))
-        if self._second is not None and len(waiting) > 1:
-            yield from self._two_at_a_time(self._second, work, waiting)
-        while waiting:
-            number, item = waiting.popleft()
+        """Do something with every item, in order; see `Executor`."""
+        for number, item in enumerate(items):
             yield number, work(item)
-
-    def _two_at_a_time(
-        self, second: SecondProcess, work: Callable[[T], R], waiting: deque[tuple[int, T]]
-    ) -> Generator[tuple[int, R]]:
-        """Do items here and in the second process, until none is left or that process dies.
-
-        Whichever has done an item takes the next one.  This process has the first.
-        """
-        done: SimpleQueue[tuple[int, R]] = SimpleQueue()
-
-        def send() -> None:
-            while (taken := _next_of(waiting)) is not None:
-                number, item = taken
-                try:
-                    done.put((number, work(item)))
-                except BrokenProcessPool:
-                    waiting.append(taken)
-                    raise
-
-        with ThreadPoolExecutor(1, initializer=_ELSEWHERE.set, initargs=(True,)) as sender:
-            own = _next_of(waiting)
-            sent = sender.submit(send)
-            try:
-                while own is not None:
-                    yield own[0], work(own[1])
-                    while not done.empty():
-                        yield done.get()
-                    own = None if sent.done() else _next_of(waiting)
-                sent.result()
-            except BrokenProcessPool:
-                warnings.warn(_LOST, stacklevel=2)
-                self._second = None
-            finally:
-                if not sent.done():  # nobody waits for it any more
-                    waiting.clear()
-                    second.end()
-                    self._second = None
-            while not done.empty():
-                yield done.get()
 
     def warnings(self, memory_limit_mb: int) -> list[str]:
         """Return no warnings; see `Executor`."""
         del memory_limit_mb
         return []
-
-
-def _next_of(waiting: deque[T]) -> T | None:
-    """Take the first of what waits, which another thread may take as well; None if none is left."""
-    try:
-        return waiting.popleft()
-    except IndexError:
-        return None
-
-
-_ELSEWHERE: ContextVar[bool] = ContextVar("elsewhere", default=False)
-"""Whether the thread sends its jobs to the second process."""
-
-
-def _second_for(movie: Path | None, workers: int) -> SecondProcess | None:
-    """Start a second process where a movie is large enough to be worth it."""
-    if movie is None or min(workers, processors()) < 2:
-        return None
-    try:
-        large = movie.is_file() and movie.stat().st_size > _LARGE_BYTES
-    except OSError:  # said in words by what opens the movie
-        return None
-    return SecondProcess(_IMPORTED) if large else None
 
 
 class DaskExecutor:
@@ -234,11 +142,6 @@ class DaskExecutor:
         for worker, found in self._client.run(look).items():
             _compare(self._versions, found["versions"], worker)
             self._memory[worker] = found["memory"]
-
-    def threads(self, wanted: int, jobs: int) -> int:
-        """Use as many as are wanted; see `Executor`."""
-        del jobs
-        return wanted
 
     def warnings(self, memory_limit_mb: int) -> list[str]:
         """Say which workers are missing or have too little memory; see `Executor`."""
@@ -382,17 +285,9 @@ def _work(expected: dict[str, str], sent: bytes) -> bytes:
 
 @contextmanager
 def open_executor(
-    scheduler: str = THREADS,
-    scheduler_file: str | Path | None = None,
-    *,
-    shared: Path | None = None,
-    workers: int = 1,
+    scheduler: str = THREADS, scheduler_file: str | Path | None = None
 ) -> Iterator[Executor]:
-    """Connect to where work shall run.
-
-    Where this process does it, and with more than one worker, a second one helps with a large
-    movie, `shared`.  Only a program may ask for that, whose main module can be imported again.
-    """
+    """Connect to where work shall run."""
     for name, value in (("scheduler", scheduler), ("scheduler_file", scheduler_file)):
         if value is not None and not isinstance(value, (str, Path)):
             raise ConfigError(f"`{name}` = {value!r}: give a text or a path")
@@ -404,16 +299,7 @@ def open_executor(
             )
         scheduler = _address_in(Path(scheduler_file))
     elif scheduler == THREADS:
-        second = _second_for(shared, workers)
-        if second is None:
-            yield LocalExecutor()
-            return
-        try:
-            yield LocalExecutor(second)
-        except BaseException:
-            second.end()
-            raise
-        second.close()
+        yield LocalExecutor()
         return
     elif ":" not in scheduler:
         raise ConfigError(

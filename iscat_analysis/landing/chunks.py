@@ -183,10 +183,9 @@ class ChunkRunner:
 
         Yields the number of frames that are done, and whether it stopped within a chunk.
         """
-        workers, executor = self.node.config.compute.workers, self._executor
         waiting: dict[int, FinishedChunk] = {}
         ready, frames = 0, 0.0
-        with threads(executor.threads(workers, len(self._parts))) as pool:
+        with threads(self.node.config.compute.workers) as pool:
             try:
                 for number, done in self._results(pool):
                     waiting[number] = done

@@ -128,10 +128,7 @@ def fit_stack(
                 executor=executor,
             )
         with parts_kept(partial if kind.keeps_parts else None):
-            write_report(
-                analysis, folder, overwrite=overwrite, event_figures=kind.event_figures,
-                executor=executor,
-            )  # fmt: skip
+            write_report(analysis, folder, overwrite=overwrite, event_figures=kind.event_figures)
         if not analysis.summary["interrupted"]:
             remove_parts(partial)
     if analysis.summary["interrupted"]:

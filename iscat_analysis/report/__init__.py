@@ -11,10 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from markupsafe import Markup
-
-from iscat_analysis.executors import Executor, LocalExecutor
-from iscat_analysis.records import Analysis, Progress, silent
+from iscat_analysis.records import Analysis
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output
 from iscat_analysis.report.tables import event_table, write_posterior, write_tables
 
@@ -30,7 +27,6 @@ __all__ = [
     "OUTPUT_NAMES",
     "atomic_folder",
     "check_output",
-    "draw_part",
     "fill_report",
     "render_page",
     "render_report",
@@ -38,7 +34,6 @@ __all__ = [
 ]
 
 _PAGES = {"render_page": "page", "render_report": "movie_page"}
-_HERE, _ELSEWHERE = 0, 1
 
 
 def __getattr__(name: str) -> Any:
@@ -49,12 +44,7 @@ def __getattr__(name: str) -> Any:
 
 
 def write_report(
-    analysis: Analysis,
-    folder: Path,
-    *,
-    overwrite: bool = False,
-    event_figures: int = EVENT_FIGURES,
-    executor: Executor | None = None,
+    analysis: Analysis, folder: Path, *, overwrite: bool = False, event_figures: int = EVENT_FIGURES
 ) -> Path:
     """Write everything one analysis found into a folder.
 
@@ -64,46 +54,26 @@ def write_report(
     appears complete or not at all; an earlier result is replaced only once the new one is complete.
     """
     with atomic_folder(folder, overwrite) as building:
-        fill_report(analysis, building, event_figures=event_figures, executor=executor)
+        fill_report(analysis, building, event_figures=event_figures)
     return folder
 
 
-def fill_report(
-    analysis: Analysis, folder: Path, *, event_figures: int, executor: Executor | None = None
-) -> None:
-    """Write a report into a folder of its own; two processes draw it where there is a second one.
+def fill_report(analysis: Analysis, folder: Path, *, event_figures: int) -> None:
+    """Write a report into a folder of its own."""
+    from iscat_analysis.report.movie_page import (  # Matplotlib takes long to load
+        page_context,
+        page_of,
+        page_sketches,
+        publish_figures,
+    )
 
-    Matplotlib takes long to load.  The second process has loaded it by now; this one loads it while
-    the second one draws.
-    """
     pictures = folder / "figures"
     pictures.mkdir(exist_ok=True)
     write_tables(analysis, folder)
     write_posterior(analysis, folder / "posterior.nc")
-    place = LocalExecutor() if executor is None or executor.distant else executor  # it writes here
-    parts = place.each(
-        lambda part: place.call(draw_part, analysis, pictures, event_figures, part),
-        (_HERE, _ELSEWHERE),
-    )
-    _, figures = next(parts)
-
-    from iscat_analysis.report.movie_page import page_context, page_of, page_sketches
-
+    figures = publish_figures(analysis, pictures, event_figures)
     table = event_table(analysis)
     about = page_context(analysis, table, pictures)
-    for _, some in parts:
-        figures |= some
     shown = [name for name, _ in page_sketches(analysis, table)]
     page = page_of(about, {name: figures[name] for name in shown if name in figures})
     (folder / "report.html").write_text(page, encoding="utf-8")
-
-
-def draw_part(
-    analysis: Analysis, folder: Path, most: int, part: int, *, progress: Progress = silent
-) -> dict[str, Markup]:
-    """Draw a part of the figures into a folder, images of `most` events among them."""
-    from iscat_analysis.report.movie_page import publish_figures
-
-    del progress
-    # one figure of three is drawn here, beside Matplotlib's loading and the page's text
-    return publish_figures(analysis, folder, most, lambda n: (n % 3 == 0) == (part == _HERE))

@@ -1,8 +1,4 @@
-"""The report page of one analysis, and its figures, drawn by two processes where there are two.
-
-Matplotlib takes long to load.  A second process has loaded it by the time it is needed; this one
-loads it while the second one draws, and so imports this module late.
-"""
+"""The report page of one analysis, and its figures."""
 
 from __future__ import annotations
 
@@ -126,13 +122,10 @@ def render_report(analysis: Analysis, *, folder: Path | None = None) -> str:
     return page_of(about, publish(drawn(page_sketches(analysis, table)), folder))
 
 
-def publish_figures(
-    analysis: Analysis, folder: Path, most: int, chosen: Callable[[int], bool]
-) -> dict[str, Markup]:
-    """Write those figures of a folder whose numbers are chosen; images of `most` events at most."""
+def publish_figures(analysis: Analysis, folder: Path, most: int) -> dict[str, Markup]:
+    """Write the figures of a folder, images of `most` events at most."""
     sketches = chain(page_sketches(analysis, event_table(analysis)), event_figures(analysis, most))
-    some = [sketch for number, sketch in enumerate(sketches) if chosen(number)]
-    return publish(drawn(some), folder)
+    return publish(drawn(sketches), folder)
 
 
 def page_sketches(analysis: Analysis, table: pd.DataFrame) -> Iterator[Sketch]:

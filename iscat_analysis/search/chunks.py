@@ -472,7 +472,7 @@ def plan_chunks(
     core = (room - 2 * halo) // stride * stride
     if core < max(halo, stride):  # most of the work would be that of halos
         return []
-    count = 2 * math.ceil((last - first) / core / 2)  # which two processes share
+    count = 2 * math.ceil((last - first) / core / 2)  # an even number
     even = (last - first) / count
     # two that are held at once have the room of two
     longer = math.ceil(min(_FIRST_LONGER * even, 2 * core - even) / stride) * stride

@@ -5,11 +5,7 @@ from __future__ import annotations
 import pickle
 import socket
 import sys
-import threading
-from collections.abc import Callable
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -36,74 +32,6 @@ def test_here_is_one_after_the_other() -> None:
         assert not place.distant
         assert list(place.each(lambda n: place.call(_job, n), [3, 4])) == [(0, 6), (1, 8)]
         assert place.warnings(1000) == []
-
-
-class _Beside:
-    """A second process that does its jobs at once, in the thread that sends them."""
-
-    def __init__(self, lost_at: int | None = None) -> None:
-        self.jobs: list[int] = []
-        self.several = threading.Event()
-        self._lost_at = lost_at
-        self.ended = False
-
-    def call(self, job: Callable[..., int], number: int) -> int:
-        if number == self._lost_at:
-            raise BrokenProcessPool
-        self.jobs.append(number)
-        if len(self.jobs) == 3:
-            self.several.set()
-        return job(number)
-
-    def end(self) -> None:
-        self.ended = True
-
-
-def test_whoever_has_done_an_item_takes_the_next() -> None:
-    beside = _Beside()
-    place = LocalExecutor(cast("Any", beside))
-
-    def here(number: int) -> int:
-        assert beside.several.wait(60)  # the other one has done three meanwhile
-        return _job(number)
-
-    found = dict(place.each(lambda n: place.call(_job, n, here=lambda: here(n)), range(5)))
-    assert found == {k: 2 * k for k in range(5)}
-    assert beside.jobs[:3] == [1, 2, 3]
-    assert not beside.ended
-
-
-def test_items_of_a_process_that_is_lost_are_done_here() -> None:
-    beside = _Beside(lost_at=2)
-    place = LocalExecutor(cast("Any", beside))
-    begun = threading.Event()
-
-    def here(number: int) -> int:
-        if number == 0:
-            assert begun.wait(60)
-        return _job(number)
-
-    def work(number: int) -> int:
-        if number == 2:
-            begun.set()
-        return place.call(_job, number, here=lambda: here(number))
-
-    with pytest.warns(UserWarning, match="the second process was ended from outside"):
-        found = dict(place.each(work, range(5)))
-    assert found == {k: 2 * k for k in range(5)}
-    assert 2 not in beside.jobs
-
-
-def test_what_fails_in_the_other_process_is_raised_here() -> None:
-    place = LocalExecutor(cast("Any", _Beside()))
-
-    def work(number: int) -> int:
-        if number == 1:
-            raise DataError("unreadable")
-        return _job(number)
-
-    with pytest.raises(DataError, match="unreadable"):
-        list(place.each(work, range(4)))
 
 
 @pytest.fixture
