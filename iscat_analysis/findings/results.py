@@ -32,8 +32,8 @@ NOTHING_FOUND = define(
     "nothing-found",
     Severity.CAUTION,
     "Nothing was found in this movie that stands out from its noise",
-    "if particles can be seen by eye, look at the field image and the laser power below, then at "
-    "detection.polarity, detection.false_alarms_per_movie and the two frame ranges",
+    "if particles can be seen by eye, look at the field image and the light of the frames below, "
+    "then at detection.polarity, detection.false_alarms_per_movie and the two frame ranges",
 )
 
 NO_TRACK = define(

@@ -307,14 +307,11 @@ def write_paper(
     """Write every panel of D21, Table 1 and the page that compares them."""
     with atomic_folder(folder, overwrite, known=PAPER_FILES) as building:
         write_csv(_images_table(images, field_nm), building / "fig_2a.csv", 5)
-        figures = {"table_1": table_figure(table), "fig_2a": images_figure(images, field_nm)}
         for panel in PANELS:
-            rows = curves[curves["panel"] == panel]
-            write_csv(rows, building / f"fig_{panel}.csv")
-            figures[f"fig_{panel}"] = panel_figure(panel, rows, quantum)
+            write_csv(curves[curves["panel"] == panel], building / f"fig_{panel}.csv")
         for name in ("table_1.csv", "comparison.csv"):
             write_csv(table, building / name)
-        drawn = publish(figures.items(), building)
+        drawn = publish(_paper_figures(curves, images, table, quantum, field_nm), building)
         bar = [("table-1", "Table 1"), *((f"figure-{n}", f"Figure {n}") for n in (2, 3, 4))]
         page = render_document(
             "Dong et al. (2021), printed and exact",
@@ -329,6 +326,20 @@ def write_paper(
         )
         (building / "comparison.html").write_text(page, encoding="utf-8")
     return folder
+
+
+def _paper_figures(
+    curves: pd.DataFrame,
+    images: Mapping[tuple[str, float], FloatArray],
+    table: pd.DataFrame,
+    quantum: Mapping[tuple[str, str], FloatArray],
+    field_nm: float,
+) -> Iterator[tuple[str, Figure]]:
+    """Draw every panel; a generator, so that `publish` draws in its own style."""
+    yield "table_1", table_figure(table)
+    yield "fig_2a", images_figure(images, field_nm)
+    for panel in PANELS:
+        yield f"fig_{panel}", panel_figure(panel, curves[curves["panel"] == panel], quantum)
 
 
 def _images_table(images: Mapping[tuple[str, float], FloatArray], field_nm: float) -> pd.DataFrame:
@@ -371,8 +382,8 @@ def _sections(table: pd.DataFrame, drawn: Mapping[str, Markup]) -> list[Section]
     titles = {"2a": "Fig. 2a: images", **{p: spec.title for p, spec in PANELS.items()}}
     for panel, title in titles.items():
         title = title.replace("Fig. ", "Figure ")
-        of = title.partition(": ")[2].capitalize()
-        charts = [Chart(f"chart-{panel}", of, drawn[f"fig_{panel}"], wide=True)]
+        subject = title.partition(": ")[2].capitalize()
+        charts = [Chart(f"chart-{panel}", subject, drawn[f"fig_{panel}"], wide=True)]
         name = names.get(panel, f"panel-{panel}")
         sections.append(Section(name, title, _LEADS.get(panel, ""), charts=charts))
     return sections

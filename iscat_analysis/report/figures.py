@@ -75,11 +75,8 @@ def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[Sketch]:
     yield "spread", partial(spread, analysis)
     yield "budget", partial(budget, analysis)
     yield "diagnostics", partial(diagnostics, analysis, table)
-    power_known = np.isfinite(np.asarray(analysis.power, float))
-    if analysis.summary.get("timeline"):  # which has the power of every frame too
+    if analysis.summary.get("timeline"):
         yield "movie", partial(movie_figure, analysis)
-    elif power_known.size > 1 and power_known.any():
-        yield "power", partial(power, analysis)
 
 
 # ---- The field -----------------------------------------------------------------------------------
@@ -344,21 +341,6 @@ def _draw_noise(noise: Mapping[str, Any], axes: Axes) -> None:
 # ---- Where in the movie? -------------------------------------------------------------------------
 
 
-def power(analysis: Analysis) -> Figure:
-    """Draw the laser power of each frame used."""
-    figure = new_figure(7.0, 2.3)
-    axes = figure.add_subplot()
-    _draw_light(analysis, axes)
-    axes.set(xlabel="frame", ylabel="laser power, relative")
-    axes.locator_params(axis="y", nbins=5)
-    return figure
-
-
-def _draw_light(analysis: Analysis, axes: Axes) -> None:
-    axes.axhline(1.0, color=GREY, lw=0.8, ls="--")
-    axes.plot(analysis.power_frames, analysis.power, color=BLUE, lw=0.8)
-
-
 def movie_figure(analysis: Analysis) -> Figure:
     """Draw light, noise, focus, drift and events of a movie, on one axis of frames."""
     course = analysis.summary["timeline"]
@@ -395,6 +377,10 @@ def _rows(analysis: Analysis, course: Mapping[str, Any]) -> dict[str, Callable[[
         for name in ("frames", "noise_over_expected", "focus_nm", "drift_x_px", "drift_y_px")
     )
 
+    def light(axes: Axes) -> None:
+        axes.axhline(1.0, color=GREY, lw=0.8, ls="--")
+        axes.plot(analysis.power_frames, analysis.power, color=BLUE, lw=0.8)
+
     def noise_row(axes: Axes) -> None:
         axes.axhline(1.0, color=GREY, lw=0.8, ls="--")
         axes.plot(frames, noise, "o", color=VERMILLION, ms=2.5)
@@ -417,7 +403,7 @@ def _rows(analysis: Analysis, course: Mapping[str, Any]) -> dict[str, Callable[[
 
     has_focus = analysis.scheme_kind.interferes and np.isfinite(focus).any()
     rows = (
-        (np.isfinite(analysis.power).any(), "light,\nrelative", partial(_draw_light, analysis)),
+        (np.isfinite(analysis.power).any(), "light,\nrelative", light),
         (np.isfinite(noise).any(), "noise,\nvariance over\nexpected", noise_row),
         (has_focus, "focus\n[nm]", focus_row),
         (np.isfinite(x).any(), "drift\n[px]", drift),
@@ -430,23 +416,17 @@ def _rows(analysis: Analysis, course: Mapping[str, Any]) -> dict[str, Callable[[
 
 
 def draw(analysis: Analysis, kind: str) -> Figure:
-    """Draw one figure of the whole analysis."""
+    """Draw one figure of the whole analysis: overview, histogram or precision."""
     table = event_table(analysis)
-    tracked = analysis.tracks is not None
-    kinds: dict[str, Callable[[], Figure]] = {
-        "overview": partial(track_figures.trajectories if tracked else overview, analysis, table),
-        "histogram": partial(track_figures.distributions, analysis)
-        if tracked
-        else partial(histogram, analysis, table),
-        "precision": partial(precision, analysis, table),
-        "power": partial(power, analysis),
-    }
-    if kind not in kinds:
-        raise ValueError(f"kind = {kind!r}: choose one of {', '.join(kinds)}")
     main = table[main_quantity(analysis).column].to_numpy(float)
-    if kind in ("histogram", "precision") and not np.isfinite(main).any():
+    if kind != "overview" and not np.isfinite(main).any():
         raise DataError(f"{_movie(analysis)}: no event was found, so there is no {kind} to draw")
-    return _shown(kinds[kind])
+    if analysis.tracks is not None and kind == "overview":
+        return _shown(partial(track_figures.trajectories, analysis, table))
+    if analysis.tracks is not None and kind == "histogram":
+        return _shown(partial(track_figures.distributions, analysis))
+    makers = {"overview": overview, "histogram": histogram, "precision": precision}
+    return _shown(partial(makers[kind], analysis, table))
 
 
 def draw_view(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:

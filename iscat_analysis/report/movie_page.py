@@ -58,7 +58,6 @@ from iscat_analysis.report.figures import page_figures
 from iscat_analysis.report.numbers import (
     LABELS,
     UNITS,
-    Column,
     Fact,
     Table,
     decimals_for,
@@ -333,10 +332,6 @@ def _precision_table(analysis: Analysis, precision: Sequence[Precision]) -> Tabl
         else "from parts of the events' own frames, and at full length where there is no particle"
     )
     has_holevo = any(math.isfinite(p.holevo) for p in precision)
-
-    def optional(column: Column, shown: bool) -> list[Column]:
-        return [column] if shown else []
-
     columns = [
         worded("Medians", lambda p: f"{label_of(analysis, p.name)} [{UNITS[p.name]}]"),
         numeric(
@@ -344,28 +339,22 @@ def _precision_table(analysis: Analysis, precision: Sequence[Precision]) -> Tabl
             lambda p: number(p.sigma),
             "standard deviation, from the curvature of the likelihood at its maximum",
         ),
-        *optional(
-            numeric(
-                "common",
-                lambda p: number(p.systematic),
-                "error that all events of the movie share, from calibrations; not part of σ, and "
-                "not lessened by averaging",
-            ),
-            any(math.isfinite(p.systematic) for p in precision),
+        numeric(
+            "common",
+            lambda p: number(p.systematic),
+            "error that all events of the movie share, from calibrations; not part of σ, and not "
+            "lessened by averaging",
         ),
         numeric(
             "CRB",
             lambda p: number(p.crb),
             "classical Cramér–Rao bound: the best any unbiased estimator can do with these images",
         ),
-        *optional(
-            numeric(
-                "Holevo",
-                lambda p: number(p.holevo),
-                "the best that one measurement of the collected light can do for all free "
-                "parameters at once",
-            ),
-            has_holevo,
+        numeric(
+            "Holevo",
+            lambda p: number(p.holevo),
+            "the best that one measurement of the collected light can do for all free parameters "
+            "at once",
         ),
         numeric(
             "QCRB",
@@ -377,13 +366,10 @@ def _precision_table(analysis: Analysis, precision: Sequence[Precision]) -> Tabl
             lambda p: number(p.over_crb),
             "median of the events' own ratios; near 1 by construction",
         ),
-        *optional(
-            numeric(
-                "measured / CRB",
-                lambda p: p.measured_text if p.is_measured else "—",
-                f"measured spread over the bound, with its 95 % interval: {where}",
-            ),
-            any(p.is_measured for p in precision),
+        numeric(
+            "measured / CRB",
+            lambda p: p.measured_text if p.is_measured else "—",
+            f"measured spread over the bound, with its 95 % interval: {where}",
         ),
         numeric(
             "light used",
@@ -393,6 +379,12 @@ def _precision_table(analysis: Analysis, precision: Sequence[Precision]) -> Tabl
         ),
         numeric("frames" if tracked else "events", lambda p: str(p.events)),
     ]
+    known = {
+        "common": any(math.isfinite(p.systematic) for p in precision),
+        "Holevo": has_holevo,
+        "measured / CRB": any(p.is_measured for p in precision),
+    }
+    columns = [column for column in columns if known.get(column.label, True)]
     rows = "Single frames" if tracked else "Events"
     caption = f"{rows} whose status is ok; units in the first column"
     return replace(tabulate(precision, columns, caption), sortable=False)
@@ -584,8 +576,7 @@ def _openable(
 
 
 def measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Describe the light, windows, drift and injected particles in sentences."""
-    yield from _light_lines(summary.get("lines", {}))
+    """Describe windows, drift and injected particles in sentences."""
     background, landing = summary.get("background"), summary.get("landing")
     if background and background["drift_px"] is not None:
         (y, x), (y_se, x_se) = background["drift_px"], background["drift_error_px"]
@@ -609,42 +600,6 @@ def measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
     injection = summary.get("injection")
     if injection and injection["added"]:
         yield _injection_line(injection)
-
-
-def _light_lines(lines: Mapping[str, Any]) -> Iterator[str]:
-    """Describe what each frame was divided by."""
-    for name in ("row", "column"):
-        if share := lines.get(f"{name}_share"):
-            yield (
-                f"Whole {name}s flickered ({percent(share)} of the noise variance); each {name} of "
-                "each frame was divided by its own light."
-            )
-    if smooth := lines.get("smooth_rms"):
-        yield (
-            f"The light changed slowly over the field ({percent(smooth)} rms between frames that "
-            "are compared); each frame was divided by a polynomial of degree "
-            f"{lines['smooth_degree']}."
-        )
-    if fringes := lines.get("fringe_periods_px"):
-        periods = " and ".join(fixed(period, 1) for period in fringes)
-        yield (
-            f"Fringes with a period of {periods} pixels passed over the field "
-            f"({percent(lines['fringe_rms'])} rms between frames that are compared); each frame "
-            "was divided by its own."
-        )
-    seams = [
-        f"{name} {cut}" for name in ("row", "column") for cut in lines.get(f"seam_{name}s", ())
-    ]
-    if seams:
-        yield (
-            f"Parts of the field, which begin at {' and '.join(seams)}, changed as a whole; each "
-            "part of each frame was divided by its own light."
-        )
-    if haze := lines.get("haze"):
-        yield (
-            f"What is added to all pixels alike changed by {percent(haze)} of the mean light; each "
-            "frame was divided by what that makes of it."
-        )
 
 
 def _injection_line(injection: Mapping[str, Any]) -> str:

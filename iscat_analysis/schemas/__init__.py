@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 _DOCUMENTS: Mapping[str, str] = {
-    "batch": "day.Batch",
+    "batch": "answers.Batch",
     "benchmark": "study.Benchmark",
     "bounds": "bounds.Bounds",
     "calibration": "calibration.MassCalibration",
@@ -32,7 +32,7 @@ _DOCUMENTS: Mapping[str, str] = {
     "challenge": "study.Challenge",
     "comparison": "bounds.Comparison",
     "fit": "fit.Fit",
-    "init": "setup.Init",
+    "init": "answers.Init",
     "kd": "answers.Kd",
     "optics": "calibration.Optics",
     "optics_bounds": "bounds.OpticsBounds",

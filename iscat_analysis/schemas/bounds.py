@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 from pydantic import ConfigDict, Field
 
@@ -24,6 +24,8 @@ from iscat_analysis.schemas.base import (
     key,
     maybe,
 )
+
+Sigma = TypeVar("Sigma", bound=Closed)
 
 
 class Experiment(Document):
@@ -73,24 +75,14 @@ class Planned(Closed):
     z_nm_phase_free: Positive = maybe("The phase between particle and reference unknown [nm]")
 
 
-class BoundsPerPhoton(Document):
-    """Bounds for one scattered photon: on the camera for a CRB, collected for a QCRB."""
+class Kinds(Document, Generic[Sigma]):
+    """Bounds of each kind: for planned frames, or for one photon, scattered or collected."""
 
-    crb_single: PerPhoton = key("Everything else known")
-    crb_joint: PerPhoton = key("Over the mode's free parameters; null where not identifiable")
-    qcrb: PerPhoton = key("Quantum, everything else known")
-    qcrb_joint: PerPhoton = key("Quantum, over all four parameters")
-    qcrb_dong2021: PerPhoton = key("Quantum, with the mode weight of Dong et al. (2021)")
-
-
-class BoundsPlanned(Document):
-    """Bounds for the planned frames."""
-
-    crb_single: Planned = key("Everything else known")
-    crb_joint: Planned = key("Over the mode's free parameters; null where not identifiable")
-    qcrb: Planned = key("Quantum, everything else known")
-    qcrb_joint: Planned = key("Quantum, over all four parameters")
-    qcrb_dong2021: Planned = key("Quantum, with the mode weight of Dong et al. (2021)")
+    crb_single: Sigma = key("Everything else known")
+    crb_joint: Sigma = key("Over the mode's free parameters; null where not identifiable")
+    qcrb: Sigma = key("Quantum, everything else known")
+    qcrb_joint: Sigma = key("Quantum, over all four parameters")
+    qcrb_dong2021: Sigma = key("Quantum, with the mode weight of Dong et al. (2021)")
 
 
 class Holevo(Closed):
@@ -233,8 +225,8 @@ class Bounds(Document):
 
     at: Experiment = key("The experiment")
     n_scattered: Scattered = key("Scattered photons in all frames after")
-    per_photon: BoundsPerPhoton = key("For one scattered photon [nm; mass_rel is relative]")
-    actual: BoundsPlanned = key("For the planned frames [nm, kDa]")
+    per_photon: Kinds[PerPhoton] = key("For one scattered photon [nm; mass_rel is relative]")
+    actual: Kinds[Planned] = key("For the planned frames [nm, kDa]")
     fisher: Matrix4 = key(
         "Fisher information of all frames, order x, y, z, mass [1/nm², 1/(nm kDa), 1/kDa²]"
     )

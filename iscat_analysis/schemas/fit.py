@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from iscat_analysis.records import EVENTS, Status
+from iscat_analysis.records import EVENTS, TRACKS, Status, TrackStatus
 from iscat_analysis.schemas.base import (
     Closed,
     Convention,
@@ -25,13 +25,13 @@ from iscat_analysis.schemas.base import (
     row_model,
 )
 from iscat_analysis.schemas.calibration import Learned
-from iscat_analysis.schemas.course import LeftOut, Timeline
-from iscat_analysis.schemas.tracks import Motion, Track
 
 if TYPE_CHECKING:
     Event = Closed
+    Track = Closed
 else:
     Event = row_model("Event", "One row of fits.csv.", EVENTS, Status)
+    Track = row_model("Track", "One row of tracks.csv.", TRACKS, TrackStatus)
 
 
 class FindingEntry(Closed):
@@ -413,6 +413,75 @@ class Scale(Closed):
         "Source of the standards' optics: stored with the calibration, or else the configuration"
     )
     refusal: str | None = key("Why the model cannot convert the scale; rows are flagged")
+
+
+class Break(Closed):
+    """Frames before and after which are not compared with each other."""
+
+    start: Count = key("First frame that is left out, or the first one after a cut")
+    stop: Count = key("One past the last; the same as start where none is left out")
+    cause: str = key("What it looks like")
+
+
+class Text(Closed):
+    """A rectangle of pixels into which a text is burnt."""
+
+    rows: tuple[Count, Count] = key("Rows [start, stop)")
+    columns: tuple[Count, Count] = key("Columns [start, stop)")
+
+
+class LeftOut(Closed):
+    """Frames and pixels that are no measurement."""
+
+    analysed: list[tuple[Count, Count]] = key("Frames [start, stop) that are analysed together")
+    breaks: list[Break] = key("Where landing movies break, and why")
+    texts: list[Text] = key("Texts that are burnt in")
+
+
+class Interval(Closed):
+    """Frames of which something is to be said."""
+
+    start: Count = key("First frame")
+    stop: Count = key("One past the last; the same as start for a cut")
+    what: str = key("What it is")
+
+
+class EventCounts(Closed):
+    """Events in parts of the movie."""
+
+    edges: list[Count] = key("Frames at which the parts begin, and one past the last")
+    ok: list[Count] = key("Events whose status is ok")
+    flagged: list[Count] = key("Other events, side lobes left out")
+
+
+class Timeline(Closed):
+    """What was where in a movie, on one axis of frames; null where a part says nothing."""
+
+    frames: list[float] = key("Mean frames of the places at which some frames were looked at")
+    light_e: list[Number] = key("Mean light of a pixel [photoelectrons]")
+    noise_over_expected: list[Number] = key(
+        "Variance between neighbouring frames over that of light and read noise"
+    )
+    focus_nm: list[Number] = key("Focus with which the frames were fitted [nm]")
+    drift_x_px: list[Number] = key("Shift of the fixed pattern along x from the first place [px]")
+    drift_y_px: list[Number] = key("The same along y [px]")
+    intervals: list[Interval] = key("Frames that were left out, or partly hidden")
+    events: EventCounts = key("Events per time")
+
+
+class Motion(Document):
+    """Medians and counts of the tracks of a movie; medians are over those that are ok."""
+
+    frame_rate_hz: Number = key("Frames per second; null: there is no D")
+    exposure_ms: Number = key("Time over which motion is averaged; null: all of it")
+    status: dict[str, Count] = key("Tracks by status")
+    flags: dict[str, Count] = key("Tracks by remark")
+    medians: dict[str, Number] = key("Of n_frames, mass, D, diameter and refractive index")
+    sigma_d_over_d_median: Number = key("Median of σ of D over D")
+    begin_inside: Count = key("Tracks that begin inside the field after the first frame")
+    end_inside: Count = key("Tracks that end inside the field before the last frame")
+    cross_border: Count = key("Tracks that begin or end at the border of the field")
+    crossed: Count = key("Tracks that came nearer than detection.min_separation_nm to another")
 
 
 class Summary(Document):

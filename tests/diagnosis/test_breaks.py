@@ -19,7 +19,7 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline.finish import look_at
 from iscat_analysis.report.figures import movie_figure
-from iscat_analysis.schemas.course import LeftOut, Timeline
+from iscat_analysis.schemas.fit import LeftOut, Timeline
 from iscat_analysis.study import Movie
 
 Counts = NDArray[np.uint16]

@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 import iscat_analysis as ia
 from iscat_analysis import notebook as shown
 from iscat_analysis.records import REPEAT_COLUMNS
-from iscat_analysis.report.figures import draw
 
 SMALL = {
     "simulation.frames": 120,
@@ -205,11 +204,9 @@ def test_the_notebook_table_is_escaped_and_short(result, monkeypatch) -> None:
 
 def test_figures_are_matplotlibs_and_draw_themselves(result) -> None:
     drawn = [result.overview(), result.view(0), result.histogram(), result.precision()]
-    for figure in [*drawn, result.corner(1), draw(result.analysis, "power")]:
+    for figure in [*drawn, result.corner(1)]:
         assert isinstance(figure, Figure)
         assert figure._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
-    with pytest.raises(ValueError, match="choose one of overview"):
-        draw(result.analysis, "pie")
 
 
 def test_pyplot_is_left_alone(loaded) -> None:

@@ -133,7 +133,7 @@ class TestFolder:
     def test_figures_come_in_pairs(self, folder: Path) -> None:
         stems = {path.stem for path in (folder / "figures").glob("*.png")}
         assert stems == {path.stem for path in (folder / "figures").glob("*.svg")}
-        assert {"overview", "precision", "mass_histogram", "power", "event_0000"} <= stems
+        assert {"overview", "precision", "mass_histogram", "timeline", "event_0000"} <= stems
         assert {stem for stem in stems if "corner" in stem} == {"corner_0001", "corner_0002"}
 
     def test_the_budget_is_drawn_and_adds_up(self, folder: Path) -> None:
