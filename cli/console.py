@@ -81,8 +81,6 @@ class Messages:
         for text in () if self.quiet else texts:
             self._line(f"{self.name}: {_one_line(with_options(text))}")
 
-    notify = note
-
     def report(self, *findings: Finding | None) -> None:
         """Print findings; what is None was not found."""
         self.note(*(finding.text for finding in findings if finding is not None))
@@ -357,11 +355,6 @@ def grouped(number: float) -> str:
 def short(value: float | None, digits: int = 4) -> str:
     """Write a number to a few significant digits, and a dash for one that is not known."""
     return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}g}"
-
-
-def print_json(document: str, values: Mapping[str, Any]) -> None:
-    """Print one JSON object on stdout; `document` names its `iscat_analysis.schema`."""
-    Messages("", json=True).show(document, values, ())
 
 
 def _write(stream: TextIO | None, text: str) -> None:

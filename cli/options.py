@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import inspect
 import re
-import sys
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass
@@ -139,7 +138,7 @@ class MovieSetup(Setup):
         source: Path | list[Path] | None = self.config
         beside = setup_beside(movie)
         if not source and is_file(beside):
-            messages.notify(f"the configuration is {beside}, which lies beside the movie")
+            messages.note(f"the configuration is {beside}, which lies beside the movie")
             source = beside
         return load_config(with_line(source, self.calibration), self.changes)
 
@@ -244,7 +243,7 @@ def command(work: Callable[..., None]) -> Command:
         )
         if len(configs := given.get("config") or ()) > 1:
             first, *later = map(str, configs)
-            told.notify(f"the configuration is {first}, with the keys of {', then '.join(later)}")
+            told.note(f"the configuration is {first}, with the keys of {', then '.join(later)}")
         for name, group in groups.items():
             given[name] = group(**{field.name: given.pop(field.name) for field in fields(group)})
         with failures(told):
@@ -265,7 +264,6 @@ def command(work: Callable[..., None]) -> Command:
     vars(run)["__signature__"] = inspect.Signature(named)
     run.__annotations__ = {each.name: each.annotation for each in described}
     run.__doc__ = about
-    example = example or vars(sys.modules[work.__module__]).get("EXAMPLE", "")
     return Command(work.__name__, about.partition("\n")[0], example, run)
 
 
@@ -372,24 +370,23 @@ def frame_range(option: str, text: str | None) -> tuple[int, int] | None:
     return parsed(option, text, read, f"{form} {option} 0:200")
 
 
-def numbers(option: str, text: str | None, form: str = "masses in kDa as in {} 66,132") -> Any:
+def numbers(
+    option: str,
+    text: str | None,
+    form: str = "masses in kDa as in {} 66,132",
+    kind: Callable[[str], float] = float,
+) -> Any:
     """Read ``66,132``."""
-    return parsed(
-        option,
-        text,
-        lambda text: [float(part) for part in text.split(",")],
-        f"write {form.format(option)}",
-    )
+
+    def read(text: str) -> list[float]:
+        return [kind(part) for part in text.split(",")]
+
+    return parsed(option, text, read, f"write {form.format(option)}")
 
 
 def whole(option: str, text: str | None) -> Any:
     """Read ``1,2,4``."""
-    return parsed(
-        option,
-        text,
-        lambda text: [int(part) for part in text.split(",")],
-        f"write whole numbers as in {option} 1,2,4",
-    )
+    return numbers(option, text, "whole numbers as in {} 1,2,4", int)
 
 
 def pair(option: str, text: str | None) -> tuple[float | None, float | None]:
