@@ -249,9 +249,32 @@ def failures(messages: Messages) -> Iterator[None]:
 _OPTIONS = {
     **{
         name: name
-        for name in ("calibration", "config", "dark", "draws", "free", "hold", "inactive", "inject",
-                     "k", "kd", "ladder", "landing", "maps", "model", "offset", "optimize", "out",
-                     "overwrite", "scan", "scheduler", "standards", "steps", "target", "truth")
+        for name in (
+            "calibration",
+            "config",
+            "dark",
+            "draws",
+            "free",
+            "hold",
+            "inactive",
+            "inject",
+            "k",
+            "kd",
+            "ladder",
+            "landing",
+            "maps",
+            "model",
+            "offset",
+            "optimize",
+            "out",
+            "overwrite",
+            "scan",
+            "scheduler",
+            "standards",
+            "steps",
+            "target",
+            "truth",
+        )
     },
     "above_kda": "above",
     "settings": "set",
@@ -270,7 +293,7 @@ _OPTIONS = {
     "scheduler_file": "scheduler-file",
     "sigma_kda": "sigma",
     "standards_kda": "standards",
-}  # fmt: skip
+}
 """Argument of the library → option of a command."""
 
 _KEYS_WITH_OPTIONS = (

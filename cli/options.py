@@ -406,6 +406,9 @@ def monomer(option: str, text: str | None) -> float | Literal["auto"] | None:
 
 
 _READERS: dict[str, Callable[[str, str | None], Any]] = {
-    "numbers": numbers, "whole": whole, "monomer": monomer, "pair": pair,
-}  # fmt: skip
+    "numbers": numbers,
+    "whole": whole,
+    "monomer": monomer,
+    "pair": pair,
+}
 """How values are read whose type no command line knows."""

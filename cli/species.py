@@ -79,9 +79,8 @@ def species(
     rates = _rates(events[0], events_of, frame_rate, frames)
     notes: list[str] = []
     found = find_species(
-        events_of, **options, **written, kinetics=rates, draws=draws, seed=seed,
-        notify=notes.append,
-    )  # fmt: skip
+        events_of, **options, **written, kinetics=rates, draws=draws, seed=seed, notify=notes.append
+    )
     values = {"source": str(events[0]), **found.to_dict(), "notes": notes}
     if rates is not None:
         values["kinetics"] = rates.to_dict()
@@ -140,8 +139,17 @@ def _comparison_lines(name: str, first: str, found: Comparison) -> Iterator[Rend
         f"{short(found.same_masses.p_value, 2)} that masses are the same, "
         f"{short(found.same_fractions.p_value, 2)} that fractions are"
     )
-    shown = table("species [kDa]", "shift [kDa]", "95 %", "shift [%]", "95 %", "fraction",
-                  "there", "difference [%]", "95 %")  # fmt: skip
+    shown = table(
+        "species [kDa]",
+        "shift [kDa]",
+        "95 %",
+        "shift [%]",
+        "95 %",
+        "fraction",
+        "there",
+        "difference [%]",
+        "95 %",
+    )
     for row in found.species.to_dict("records"):
         shown.add_row(
             short(row["mass_kda"]),

@@ -66,9 +66,19 @@ ROWS_SHOWN = 20
 
 _COLUMNS = ("event", "frame", "x_px", "y_px", "z_nm", "mass_kda")
 _TRACK_COLUMNS = (
-    "track", "first_frame", "last_frame", "n_frames", "mass_kda", "sigma_mass_kda", "crb_mass_kda",
-    "d_um2_s", "sigma_d_um2_s", "crb_d_um2_s", "diameter_nm", "sigma_diameter_nm",
-)  # fmt: skip
+    "track",
+    "first_frame",
+    "last_frame",
+    "n_frames",
+    "mass_kda",
+    "sigma_mass_kda",
+    "crb_mass_kda",
+    "d_um2_s",
+    "sigma_d_um2_s",
+    "crb_d_um2_s",
+    "diameter_nm",
+    "sigma_diameter_nm",
+)
 
 
 @dataclass(frozen=True, repr=False)
@@ -574,9 +584,15 @@ def calibrate_optics(
     if out is not None:
         folder = path_in("`out`", out)
         return optics_calibration(
-            movie, resolved, folder, name=name, free=free, focus_step_nm=focus_step_nm,
-            overwrite=overwrite, progress=progress,
-        )  # fmt: skip
+            movie,
+            resolved,
+            folder,
+            name=name,
+            free=free,
+            focus_step_nm=focus_step_nm,
+            overwrite=overwrite,
+            progress=progress,
+        )
     with open_stack(movie, name=name) as stack:
         return calibrate_movie(
             stack, resolved, free=free, focus_step_nm=focus_step_nm, progress=progress

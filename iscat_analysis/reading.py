@@ -32,9 +32,19 @@ LARGEST_TEMPLATE_BYTES = 100_000_000
 """No measured picture of a particle is larger."""
 
 _OF_DAMAGE = (
-    OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, SyntaxError, MemoryError,
-    RuntimeError, ArithmeticError, tokenize.TokenError, struct.error,
-)  # fmt: skip
+    OSError,
+    EOFError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    SyntaxError,
+    MemoryError,
+    RuntimeError,
+    ArithmeticError,
+    tokenize.TokenError,
+    struct.error,
+)
 _FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 _MOST_DOTS = 64  # of a key; tomllib takes the square of their number
 _DOT = re.compile(r"(?<!\.)\.(?!\.)")

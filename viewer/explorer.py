@@ -277,9 +277,14 @@ class Explorer(QWidget):
         if layer is None:
             active = self._viewer.layers.selection.active
             layer = self._viewer.add_points(
-                np.zeros((0, 3)), ndim=3, name=FOUND, size=_SPOT_PX, face_color="transparent",
-                symbol="square", border_width=_THIN,
-            )  # fmt: skip
+                np.zeros((0, 3)),
+                ndim=3,
+                name=FOUND,
+                size=_SPOT_PX,
+                face_color="transparent",
+                symbol="square",
+                border_width=_THIN,
+            )
             self._viewer.layers.selection.active = active or layer
         layer.scale, layer.translate = movie.scale[-3:], movie.translate[-3:]
         layer.data = points
@@ -323,9 +328,13 @@ class Explorer(QWidget):
             low, high = film_limits(frames.__getitem__, (0, len(frames)))
             limit = max(abs(low), abs(high))
             layer = self._viewer.add_image(
-                frames, name=RATIO, colormap="gray", contrast_limits=(-limit, limit),
-                scale=movie.scale[-3:], translate=movie.translate[-3:],
-            )  # fmt: skip
+                frames,
+                name=RATIO,
+                colormap="gray",
+                contrast_limits=(-limit, limit),
+                scale=movie.scale[-3:],
+                translate=movie.translate[-3:],
+            )
             self._ratio = _Ratio(layer, frames)
 
     # ---- events ----------------------------------------------------------------------------
