@@ -407,7 +407,7 @@ def _of_the_paper(scheme: str, kind: str) -> Part:
 
 def parts_of_config(config: Config, count: int) -> list[Part]:
     """Make a challenge of a configuration: stacks of ``[bounds]``, a movie of ``[simulation]``."""
-    mode = config.fit.mode if config.fit.mode != "track" else "joint"
+    mode = "joint" if config.fit.follows_tracks else config.fit.mode
     config = config.model_copy(update={"fit": config.fit.model_copy(update={"mode": mode})})
     parts = [Part("stack", "stacks", config, config, count, mass_factor=(0.5, 2.0))]
     if config.simulation.events or config.simulation.count:

@@ -426,7 +426,7 @@ def _job(challenge: Challenge, parts: Sequence[str], events: pd.DataFrame) -> _C
                 starts[i, :2] = middle[::-1] * pixel
     photons = about.get("photons_per_pixel") or float(np.nanmean(sums[0]) / n_before)
     if not n_before:
-        dark = told.optics.scheme == "darkfield"
+        dark = not told.optics.interferes
         sums[0] = (told.background.level_e or 0.0) if dark else photons
     changes = {"n_before": n_before, "n_after": n_after, "photons_per_pixel": photons}
     told = told.model_copy(update={"bounds": told.bounds.model_copy(update=changes)})
@@ -465,7 +465,7 @@ def score_own(truth: Path, results: Path, config: Config, *, command: str = "") 
         raise ConfigError(
             "camera.pixel_size_nm is needed: give it, as in camera.pixel_size_nm = 84.4"
         )
-    mode = config.fit.mode if config.fit.mode != "track" else "joint"
+    mode = "joint" if config.fit.follows_tracks else config.fit.mode
     free = FREE_PARAMETERS[mode]
     known, found = (read_results(path, pixel, rows=True) for path in (truth, results))
     columns, truths = matched(found.table, known.table, config, free)

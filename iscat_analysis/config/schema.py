@@ -50,10 +50,10 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _explicit_method(self) -> Config:
-        known, tracked = self.background.frames is not None, self.fit.follows_tracks
+        known, moving = self.background.frames is not None, self.fit.follows_tracks
         if self.background.method is None:
             method = "sliding" if self.optics.interferes else "fixed"
-            method = "tracks" if tracked else method
+            method = "tracks" if moving else method
             method = "fixed" if known else method
             method = "median" if self.background.frames == ALL else method
             # The model is frozen for its users; here it is still being made.
@@ -63,12 +63,12 @@ class Config(Section):
                 'background.method = "sliding" needs an interferometric scheme: dark field needs '
                 "background.frames"
             )
-        elif self.background.slides and tracked:
+        elif self.background.slides and moving:
             raise ValueError(
                 'background.method = "sliding" has no tracks: leave it out for fit.mode = "track", '
                 "or give background.frames"
             )
-        elif self.background.learnt_with_tracks and not tracked:
+        elif self.background.learnt_with_tracks and not moving:
             raise ValueError(
                 'background.method = "tracks" is made of what fit.mode = "track" finds, and '
                 f'fit.mode is "{self.fit.mode}": use "sliding" for particles that land, or '
@@ -135,15 +135,15 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _median_has_frames(self) -> Config:
-        background, tracked = self.background, self.fit.follows_tracks
-        if background.frames == ALL and not (tracked and self.optics.interferes):
+        background, moving = self.background, self.fit.follows_tracks
+        if background.frames == ALL and not (moving and self.optics.interferes):
             raise ValueError(
                 'background.frames = "all" is for particles that move over an interferometric '
                 f'background: with fit.mode = "{self.fit.mode}" and optics.scheme = '
                 f'"{self.optics.scheme}" give the frames before the particles, as in '
                 "background.frames = [0, 200]"
             )
-        if background.method == "median" and background.frames is None and tracked:
+        if background.method == "median" and background.frames is None and moving:
             raise ValueError(
                 'background.method = "median": of which frames?  Give those before the particles, '
                 'as in background.frames = [0, 200], or background.frames = "all"'

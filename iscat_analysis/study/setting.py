@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.bounds import EventBounds, Experiment, plan
-from iscat_analysis.config import MOVING, Config, refuse_rod, refuse_sphere
+from iscat_analysis.config import MODES, MOVING, Config, refuse_rod, refuse_sphere
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import Region, region_likelihood
@@ -65,7 +65,7 @@ class Setting:
 
         In mode `size` the mass stands for the diameter, in which it is scored.
         """
-        own = "diameter_nm" if self.mode == "size" else "mass_kda"
+        own = "diameter_nm" if MODES[self.mode].fits_sizes else "mass_kda"
         return {own if n == "mass_kda" else n: PARAMETERS.index(n) for n in self.free}
 
     @property
@@ -93,7 +93,7 @@ class Setting:
 
         Shapes: `values, errors` (…, 4).
         """
-        if self.mode != "size":
+        if not MODES[self.mode].fits_sizes:
             return values, errors
         values, errors = values.copy(), errors.copy()
         particle, mass = self.config.particle, values[..., 3]
@@ -271,8 +271,8 @@ def make_setting(
         _check_place(config, side * pixel_nm / 2)
     asked = z_nm if z_nm is not None else config.bounds.z_nm
     height = config.particle.nominal_height_nm if asked is None else asked
-    counted = config.optics.scheme != "darkfield" and config.bounds.n_before > 0
-    level = config.background.method == "sliding" and counted
+    counted = config.optics.interferes and config.bounds.n_before > 0
+    level = config.background.slides and counted
     config = _changed(config, {"background": _background(config)})
     if context is None:
         context = make_context(config, (side, side))
@@ -305,7 +305,7 @@ def _background(config: Config) -> dict[str, Any]:
     at = config.bounds
     if at.n_before:
         return {"method": "fixed"}
-    dark = config.optics.scheme == "darkfield"
+    dark = not config.optics.interferes
     level = (config.background.level_e or 0.0) if dark else at.photons_per_pixel
     return {"method": "known", "frames": None, "level_e": level}
 

@@ -363,7 +363,7 @@ class Movie:
     def _background(self) -> FloatArray:
         simulation = self._config.simulation
         shape = self._grid.shape
-        if self._config.optics.scheme == "darkfield":
+        if not self._config.optics.interferes:
             level = self._config.background.level_e or 0.0
         else:
             level = simulation.photons_per_pixel
