@@ -130,6 +130,7 @@ def noise_curve(
 
 def verdict_of(noise: pd.DataFrame) -> tuple[int, str]:
     """Say up to which average the noise is shot noise."""
+    # standard errors
     within = noise["excess"] <= 1 + LEAST_EXCESS_VARIANCE + 3.0 * noise["excess_se"]
     first = noise.iloc[0]
     if not within.iloc[0]:
@@ -360,7 +361,7 @@ def _curve(
     chi2 = float(
         (((curve["variance_adu2"] - curve["fit_adu2"]) / curve["variance_se"]) ** 2).mean()
     )
-    if chi2 > 3.0:
+    if chi2 > 3.0:  # reduced
         notes.append(
             f"the variance does not follow a straight line (reduced χ² {chi2:.3g}): the camera is "
             "not linear, the frames were processed, or the light itself is noisy"

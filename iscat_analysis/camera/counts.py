@@ -314,7 +314,7 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
 
     Shapes: `counts` (t, y, x).
     """
-    if len(counts) > 1 and bytes_are_swapped(counts[:8]):
+    if len(counts) > 1 and bytes_are_swapped(counts[:8]):  # frames tell it
         raise DataError(
             f"{name}: the bytes of its numbers are the other way round: pixels leap over the range "
             f"of {counts.dtype} from one frame to the next, and do not with the bytes of each "
@@ -340,6 +340,7 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
 
 def _is_shutter(before: NDArray[Any], after: NDArray[Any]) -> bool:
     """Whether a shutter opens or closes: even the brightest pixels of one frame are dark."""
+    # above it too few pixels lie for light to be on
     low, high = sorted(float(np.quantile(frame, 0.99)) for frame in (before, after))
     return low < high / 2
 

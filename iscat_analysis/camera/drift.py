@@ -126,7 +126,7 @@ def _register(
     nowhere = math.inf, np.zeros(2), np.full(2, math.inf), 0.0
 
     def refined(shift: FloatArray) -> tuple[float, FloatArray, FloatArray, float]:
-        for _ in range(4):
+        for _ in range(4):  # passes settle
             moved = pattern
             if shift.any():
                 image_there = mover.image(spectrum * mover.transfer(shift[None], np.ones(1)))
@@ -298,6 +298,7 @@ class Pattern:
             return math.nan, math.nan
         surface = fft.irfft2(cross / np.maximum(magnitude, 1e-12 * magnitude.max()), s=self.shape)
         at = np.unravel_index(int(np.argmax(surface)), surface.shape)
+        # times the noise of random phases, whose largest is at 5
         if surface[at] * math.sqrt(surface.size) < 8.0:
             return math.nan, math.nan
         y, x = (int((i + n // 2) % n - n // 2) for i, n in zip(at, self.shape, strict=True))
@@ -315,4 +316,4 @@ def _without_spikes(image: FloatArray) -> FloatArray:
     """Replace outlying pixels by the median of their neighbours."""
     around = median_3x3(image)
     out = np.abs(image - around)
-    return np.where(out > 6.0 * robust_sigma(out), around, image)
+    return np.where(out > 6.0 * robust_sigma(out), around, image)  # a pixel that blinks

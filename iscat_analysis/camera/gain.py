@@ -43,7 +43,7 @@ def shared_light(
         return None
     counts, shape = counts[:_FRAMES], counts.shape[1:]
     places = np.arange(math.prod(shape)) if masked is None else np.flatnonzero(~masked)
-    places = places[:: max(1, -(-places.size // 4096))]
+    places = places[:: max(1, -(-places.size // 4096))]  # some thousand pixels all over the field
     offset, gain = (
         np.broadcast_to(value, shape).flat[places]
         for value in (camera.offset_adu, camera.gain_e_per_adu)
@@ -65,6 +65,7 @@ def shared_light(
     if apart <= 0 or far <= 0:
         return None
     short = 1 - near / apart
+    # the deficit, and by how much of it farther frames may differ more
     return near / apart if short > 0.1 and abs(far / apart - 1) < 0.15 * short else None
 
 
@@ -190,6 +191,7 @@ class GainDiagnosis:
     @property
     def off(self) -> bool:
         """Whether the gain is wrong by more than 10 %, and chance does not explain it."""
+        # 10 % beyond three standard errors
         return abs(self.noise_ratio - 1) > 0.10 + 3.0 * self.noise_ratio_se
 
     @property

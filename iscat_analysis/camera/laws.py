@@ -173,14 +173,14 @@ def find_law(found: Transfer, *, most_read: float = 0.0, least_offset: float = -
         if found.flicker is not None and family.kind in BENT
     ]
     both = min(pairs, key=lambda law: law.chi2, default=best)
-    if best.chi2 - both.chi2 > 20.0:
+    if best.chi2 - both.chi2 > 20.0:  # with one number more
         return both
     if linear - best.chi2 < 16.0:  # a line is as good
         zero = next(law for law in laws if law.kind == "offset")
         se = math.hypot(zero.value, zero.se)  # of zero, which is kept
         flickers = found.flicker is not None
         return Law("linear", 0.0, se, 1.0, se, chi2=linear, flickers=flickers)
-    return _among(best, [law for law in laws if law.chi2 - best.chi2 < 6.0])
+    return _among(best, [law for law in laws if law.chi2 - best.chi2 < 6.0])  # as good
 
 
 def _among(best: Law, alike: list[Law]) -> Law:
@@ -382,5 +382,5 @@ def response_of(law: Law, found: Transfer, camera: Camera, top: float) -> Respon
         n = light(np.minimum(mean, _HIGHEST * full))
         contrast = n / np.expm1(n)
     scale = float(np.average(np.square(contrast * mean) / variance / light(mean), weights=weight))
-    counts = np.linspace(zero, end, 1025)
+    counts = np.linspace(zero, end, 1025)  # points of the curve
     return Response(counts, scale * light(counts - zero))

@@ -69,6 +69,7 @@ def sample(
     Shapes: `lit` (t, y, x), `dark` (k, y, x).
     """
     total = movie.shape[0]
+    # frames all over the movie, by which the usual light is known
     looks = np.unique(np.linspace(span[0], span[1] - 1, 24).astype(int)).tolist()
     levels = [float(frame.mean()) for k in looks for frame in _finite(movie.read(k, k + 1))]
     first = min(_FIRST_FRAMES, total)
@@ -115,6 +116,7 @@ def _is_dark(dark: NDArray[Any], lit: NDArray[Any]) -> bool:
     if error < _LIT_SHARE_ERROR * as_light:
         return abs(share) < _LIT_SHARE * as_light + 3 * error
     noise = noise_adu2(dark) if len(dark) > 1 else noise_adu2(np.moveaxis(dark, 2, 0))
+    # half of the noise that its counts would have as light
     return noise < 0.5 * as_light * noise_adu2(lit)
 
 
@@ -318,6 +320,7 @@ class _Learning:
             self._set("offset_adu", float(np.mean(pixels)), error, DARK)
         if "read_noise_e" in self.free and len(dark) > 1:
             variance = np.mean(np.diff(dark.astype(np.float64), axis=0) ** 2, axis=0) / 2
+            # pixels with more noise in the dark are left out
             usual = variance < 4.0 * np.median(variance)
             self._dark_variance = float(variance[usual].mean()) if usual.any() else None
 
@@ -386,6 +389,7 @@ class _Learning:
         )
         if calm is not None and rough is not None:
             ratio = calm.noise_ratio / rough.noise_ratio
+            # motion made that share of the noise at least
             if ratio < 1 - 0.03 - 3 * calm.noise_ratio_se:
                 return found.gain_e_per_adu / ratio, found.gain_se / ratio, MEASURED
         spectrum = measure_spectrum(counts, seen)
@@ -554,7 +558,7 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, l
             if key == "pixel_size_nm":
                 _refuse_unlikely(read, metadata.source)
             found[key] = read
-        elif abs(read / given - 1) > 0.01:
+        elif abs(read / given - 1) > 0.01:  # rounding aside
             values: dict[str, float | str] = {"words": words, "given": given, "read": read}
             notes.append(
                 METADATA_DISAGREES({**values, **source, "unit": unit, "key": f"camera.{key}"})

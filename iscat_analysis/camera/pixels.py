@@ -133,6 +133,7 @@ def find_text(movie: Stack, span: tuple[int, int]) -> BoolArray | None:
     light = np.where(series == ink, np.nan, series)
     light[:, share == 1] = 0.0  # nothing but ink, or dead
     scatter = SIGMA_PER_MAD * np.nanmedian(np.abs(light - np.nanmedian(light, axis=0)), axis=0)
+    # standard deviations between ink and light, in which nothing lies
     apart = np.nanmin(np.abs(light - ink), axis=0) > 5.0 * np.maximum(scatter, 1.0)
     inked = apart & (share >= max(_AGAIN, 3 / len(counts))) & (share <= 1 - _AGAIN)
     letters = np.zeros(doubtful.shape, dtype=np.bool_)
@@ -216,7 +217,7 @@ def find_unsteady(
     """
     frames = np.array([len(block) for block in blocks])
     freedom = int((frames - 1).sum()), len(blocks) - 1
-    if freedom[0] < 20 or freedom[1] < 4:
+    if freedom[0] < 20 or freedom[1] < 4:  # frames that tell
         return None
     shape = blocks[0].shape[1:]
     summed = np.zeros(shape)
@@ -248,7 +249,7 @@ def find_unsteady(
         usual = float(np.median(ratio[lit]))
         if scatter is slow and usual > 3.0:  # by the light or the stage, and in what pattern
             continue
-        limit = chdtri(number, 1e-9) / number
+        limit = chdtri(number, 1e-9) / number  # by chance
         more = ratio > usual * limit
         more &= scatter.neighbour_products < least_beside * scatter.squares
         more &= _largest_neighbour(ratio) - usual < least_beside * (ratio - usual)
@@ -299,6 +300,7 @@ def _noisy_lines(ratio: FloatArray, lit: BoolArray, usual: float, least_beside: 
         spread = robust_sigma(excess - np.median(excess))
         padded = np.pad(excess, 1, mode="reflect")
         neighbours = np.maximum(padded[:-2], padded[2:])
+        # of the usual scatter, and in robust standard deviations of all lines
         off = excess > max(0.15 * usual, 8.0 * spread)
         odd = lines[off & (neighbours < least_beside * excess)]
         noisy[(slice(None), odd) if axis == 0 else odd] = True

@@ -79,15 +79,16 @@ def find_processing(
 
     Where particles move, coarser patterns are of them, and do not tell what was smoothed.
     """
-    rows, columns = middle_of(movie.shape, 512)
+    rows, columns = middle_of(movie.shape, 512)  # pixels along each side
     fine, coarse = _bands(rows.stop - rows.start, columns.stop - columns.start)
     found = []
+    # pairs of frames all over the movie
     starts = np.unique(np.linspace(span[0], span[1] - 2, 48).astype(int))
     for start in starts.tolist() if span[1] - span[0] > 1 else ():
         spectrum = _spectrum(movie, camera, start, (rows, columns))
         if spectrum is not None:
             found.append((spectrum[fine].mean(), spectrum[coarse].mean()))
-    if len(found) < 8:
+    if len(found) < 8:  # pairs that tell
         return None
     finest, coarser = np.array(found).T
     # |z|² of a complex normal number scatters by its mean; a normalised movie's noise changes at
@@ -114,6 +115,7 @@ def _uneven(values: FloatArray, chance: float) -> float:
     middle = float(np.median(values))
     scatter = robust_sigma(values - middle) / middle
     excess = scatter**2 - chance
+    # 2.33/√n: the relative error of a variance by the median deviation of n
     significant = excess > 6.0 * chance * 2.33 / math.sqrt(len(values))
     return math.sqrt(excess) if significant else 0.0
 
@@ -126,6 +128,7 @@ def _bands(rows: int, columns: int) -> tuple[BoolArray, BoolArray]:
     y, x = fft.fftfreq(rows)[:, None], fft.rfftfreq(columns)[None, :]
     radius = np.hypot(y, x)
     own = (y != 0) & (x > 0) & (x < 0.5)
+    # only noise is beyond half a cycle per pixel: the corners of the spectrum
     return own & (radius > 0.5), own & (radius > _COARSE[0]) & (radius < _COARSE[1])
 
 
@@ -146,6 +149,6 @@ def _spectrum(
     change = np.where(used, (after - before) / np.sqrt(np.where(used, light, 1.0)), 0.0)
     # shot noise over the light: alike in all frames, whatever the laser does
     change *= math.sqrt(2 / (1 / powers[0] + 1 / powers[1]))
-    limit = 5.0 * robust_sigma(change[used])
+    limit = 5.0 * robust_sigma(change[used])  # a change beyond is no noise
     waves = fft.rfft2(np.clip(change, -limit, limit))
     return np.asarray(np.square(waves.real) + np.square(waves.imag))

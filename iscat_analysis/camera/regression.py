@@ -140,7 +140,7 @@ def solve(
     line = None
     if reliability > LEAST_RELIABILITY:
         (intercept, slope), cov = variance_line(mean, variance, frames)
-        if slope > 0 and math.sqrt(cov[1, 1]) / slope < 0.30:
+        if slope > 0 and math.sqrt(cov[1, 1]) / slope < 0.30:  # a gain that is less certain is none
             line = intercept, slope, cov
         elif slope <= 0 and -slope > 3.0 * math.sqrt(cov[1, 1]):
             raise DataError(
@@ -175,7 +175,7 @@ def solve(
         narrower = read.adu2.se / (slope**2 * read.e2.se)
         adu = Estimate(electrons.value * slope, electrons.se * slope * narrower)
         return Solution(gain, offset, source, adu, electrons, None, intercept, slope)
-    below = math.sqrt(max(read.e2.value, 0.0) + 1.644854 * read.e2.se)
+    below = math.sqrt(max(read.e2.value, 0.0) + 1.644854 * read.e2.se)  # 95 % on one side
     notes.append(
         f"the read noise is too small beside the shot noise to be seen: below {below:.3g} e "
         "(95 %); a dark would measure it"
@@ -217,7 +217,7 @@ def _half(found: Sequence[Moments], used: BoolArray, given: float | None) -> Est
     """Read noise of every other tile of the sensor [counts²]."""
     y, x = np.indices(used.shape) // 8  # noise is correlated less far
     part = used & ((y + x) % 2 == 0)
-    if np.count_nonzero(part) < 32:
+    if np.count_nonzero(part) < 32:  # pixels that tell
         return None
     offset, _ = _offset(found, part, given, [])
     if offset is None:

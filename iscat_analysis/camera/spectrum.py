@@ -142,7 +142,7 @@ def measure_spectrum(
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """
     rows, columns = counts.shape[1:]
-    pairs = min(len(counts) // 2, 64)
+    pairs = min(len(counts) // 2, 64)  # that are compared
     if pairs < 4 or min(rows, columns) < 4 * REACH_PX:
         return None
     starts = 2 * np.linspace(0, len(counts) // 2 - 1, pairs).astype(int)
@@ -177,13 +177,15 @@ def measure_spectrum(
         z = after / powers[1] - before / powers[0]
         z /= np.sqrt(by_light * expected + by_frame * read_noise)
         z[~used] = 0.0
+        # some of as many pixels tell how large the noise is
         middle = float(np.median(np.abs(z[used][::8])))
-        return z, 5.0 * SIGMA_PER_MAD * middle
+        return z, 5.0 * SIGMA_PER_MAD * middle  # a change beyond is no noise
 
     def outliers(found: tuple[NDArray[np.float32], float] | None) -> int:
         return 0 if found is None else int(np.count_nonzero(np.abs(found[0]) > found[1]))
 
     # a pixel that blinks is in every pair; where something bright lands, its rings are no noise
+    # their median is that of a pair in which nothing lands
     few = starts[:: max(1, pairs // 9)].tolist()
     most = float(np.median([outliers(change(start)) for start in few])) + 4
 

@@ -148,7 +148,7 @@ def _binned(found: Moments, used: BoolArray, other: FloatArray) -> Transfer:
     freedom = np.full(mean.shape, found.n_frames - 1.0)
     (intercept, slope), cov = variance_line(mean, variance, freedom, tiles)
     noise = None
-    if slope > 5.0 * math.sqrt(cov[1, 1]):
+    if slope > 5.0 * math.sqrt(cov[1, 1]):  # the zero is a quotient by the slope
         gradient = np.array([-1 / slope, intercept / slope**2])
         noise = Estimate(-intercept / slope, math.sqrt(gradient @ cov @ gradient))
     seen = found.slope[used], found.slope_variance[used], mean

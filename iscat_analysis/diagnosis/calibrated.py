@@ -208,7 +208,7 @@ def metadata(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
 def breaks(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
     """Find where a landing movie breaks; what is learned of it is learned within one stretch."""
     config, movie = state.config, state.movie
-    if state.background_mode != "sliding" or not config.optics.interferes:
+    if not (config.background.slides and config.optics.interferes):
         if config.fit.excluded_frames:
             raise ConfigError(
                 "fit.excluded_frames: frames are left out of landing movies only, which have an "
@@ -248,7 +248,7 @@ def camera(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
 def repeats(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
     """Leave out frames that were stuck in the camera, where a background was recorded."""
     config = state.config
-    if state.background_mode != "fixed" or state.tracked or not config.optics.interferes:
+    if config.background.way != "fixed" or state.tracked or not config.optics.interferes:
         return state, []
     kept = without_repeats(state.movie, config, state.camera)
     state = replace(state, movie=kept.movie, steady=kept.movie, config=kept.config, kept=kept)
@@ -261,7 +261,7 @@ def counts(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
     processing = find_processing(movie, state.camera, state.span, moving=state.tracked)
     start, stop = _first_frames(state)
     seen = movie.read(start, stop)
-    if state.background_mode != "sliding":  # windows that slide pass over frames that repeat
+    if not state.config.background.slides:  # windows that slide pass over frames that repeat
         _refuse_still(seen, f"{name}: frames {start} to {stop - 1}")
     refuse_overflow(state.stored.read(start, stop), name)
     findings = [axes_warning(name, seen)]
@@ -277,9 +277,10 @@ def light(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
     movie, config, name = state.movie, state.config, state.movie.name
     opening, changes = None, None
     findings: list[Finding | None] = []
-    follow = state.ahead and (state.tracked or state.background_mode == "sliding")
+    slides = config.background.slides
+    follow = state.ahead and (state.tracked or slides)
     with one_thread_algebra():  # in all threads until the light is judged
-        if state.background_mode == "sliding":
+        if slides:
             judged, opening, motion = _landing_light(state, config)
             if config.background.drift_correction == "auto":
                 config = with_drift_correction(config, moves=bool(motion))

@@ -58,7 +58,7 @@ def channels_of(counts: NDArray[Any], camera: Camera) -> int:
     Shapes: `counts` (t, y, x).
     """
     shape = counts.shape[1:]
-    every = max(1, -(-math.prod(shape) // 4096))
+    every = max(1, -(-math.prod(shape) // 4096))  # some thousand pixels all over the field
     cut = camera.mapped(lambda image: np.broadcast_to(image, shape).reshape(-1)[::every])
     light = cut.to_electrons(counts.reshape(len(counts), -1)[:, ::every])
     power = light.mean(axis=1, keepdims=True)
@@ -71,6 +71,7 @@ def channels_of(counts: NDArray[Any], camera: Camera) -> int:
         float(np.median(np.mean((light[n:] - light[:-n]) ** 2, axis=1)))
         for n in range(1, _MOST + 1)
     ]
+    # frames of one channel differ by so much less
     found = (n for n in range(2, _MOST + 1) if apart[n - 1] < 0.1 * min(apart[: n - 1]))
     return next(found, 1)
 

@@ -25,7 +25,6 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES
 from iscat_analysis.diagnosis.recognise import least_beside, spot_of
 from iscat_analysis.findings import Finding
-from iscat_analysis.fitting.ranges import background_mode
 from iscat_analysis.movie import Stack
 from iscat_analysis.search.frames import good_frames, measure_frames, well_lit
 from iscat_analysis.search.noise import longest_window
@@ -87,12 +86,11 @@ def judge_lines(
 ) -> LightModel | None:
     """Find rows, columns and smooth light that change and may be divided out."""
     background = config.background
-    mode = background_mode(config)
     if (
         not background.power_normalization
-        or background.method == "known"
-        or (background.method == "sliding" and background.follows_pattern)
-        or (mode == "tracks" and config.track.heights_free)
+        or background.is_known
+        or (background.slides and background.follows_pattern)
+        or (background.way == "tracks" and config.track.heights_free)
     ):
         return None
     first, last = background.recorded or config.fit.frames or (0, movie.shape[0])
@@ -128,17 +126,17 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
     at by themselves, and then some of one with some of the other.  Frames in which particles move
     are compared one by one, half the movie apart: what they have in common is their background.
     """
-    total, mode, pairs_wanted = movie.shape[0], background_mode(config), PAIRS
+    total, pairs_wanted, moving = movie.shape[0], PAIRS, config.background.way == "tracks"
     large = math.prod(movie.shape[1:]) > LARGEST_PX
     if large:
         pairs_wanted //= 2
     given = config.background.recorded, config.fit.frames
-    frames_each = 8
-    if mode != "fixed":
+    frames_each = 8  # that are summed at each place
+    if moving or config.background.slides:
         first, last = given[1] or (0, total)
         spans = [(first, min(last, total))]
         window = config.background.window_frames or longest_window(last - first)
-        if mode == "tracks":
+        if moving:
             window, frames_each, pairs_wanted = (spans[0][1] - first) // 2, 1, 24
     else:
         before = given[0] or (0, 0)
@@ -146,19 +144,22 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
         spans = [(before[0], min(before[1], total)), (first, min(last, total))]
         window = max(stop - start for start, stop in spans)
     frame_bytes = math.prod(movie.shape[1:]) * np.dtype(movie.dtype).itemsize
+    # frames that tell unsteady pixels, of so few places
     fewest = min(3, frames_each) if large else 1
+    # bytes that are read
     most = min(frames_each, max(96_000_000 // (2 * pairs_wanted * frame_bytes), fewest))
     pairs_read: list[tuple[int, int]] = []
     parts: list[NDArray[Any]] = []
     for start, stop in spans:
         gap = min(window, (stop - start) // 2)
         frames_each = min(most, gap, (stop - start - gap) // 3)
-        if frames_each < 1:
+        if frames_each < 1:  # too few for three places
             continue
         room = stop - gap - frames_each - start
         # no pair has another's frames
         number = min(pairs_wanted // len(spans), room // frames_each + 1)
-        gaps = (gap, math.ceil(0.62 * gap)) if mode == "tracks" else (gap,)
+        # half the movie apart, and every second less: what comes again must not be missed
+        gaps = (gap, math.ceil(0.62 * gap)) if moving else (gap,)
         for k, frame in enumerate(np.linspace(start, start + room, number).astype(int).tolist()):
             pairs_read.append((frame, frame + gaps[k % len(gaps)]))
             parts += [movie.read(k, k + frames_each) for k in pairs_read[-1]]

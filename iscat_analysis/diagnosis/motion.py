@@ -62,9 +62,11 @@ def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[s
     limit = drift = error = None
     if windows.n_before >= 2 and is_lit(windows):
         frame_bytes = math.prod(movie.shape[1:]) * np.dtype(movie.dtype).itemsize
+        # bytes on which the noise is measured
         some = first_counts(movie, windows, max(2, 64_000_000 // frame_bytes))
         lit = well_lit(windows.power[: len(some)])
         some = some if lit.all() or lit.sum() < 2 else some[lit]
+        # the longest average of the curve
         noise = measure_noise(some, camera, min(100, len(some) // 2))
         curve, limit = (noise.frames, noise.variance_over_shot), noise.shot_limited
         moved = _pattern_moved(windows)
@@ -96,7 +98,7 @@ def _pattern_moved(windows: Windows) -> tuple[FloatArray, FloatArray] | None:
         for left in range(0, columns - side + 1, side)
     ]
     shifts = np.array([part[0] for part in parts if part is not None])
-    if len(shifts) < 4:
+    if len(shifts) < 4:  # parts whose differences tell an error
         return whole
     apart = SIGMA_PER_MAD * np.median(np.abs(shifts - np.median(shifts, axis=0)), axis=0)
     return whole[0], np.maximum(whole[1], apart * math.sqrt(math.pi / 2 / len(shifts)))
@@ -127,6 +129,6 @@ def drift_warning(name: str, background: dict[str, Any]) -> Finding | None:
         return None
     (y, x), (y_error, x_error) = background["drift_px"], background["drift_error_px"]
     pull = math.hypot(y / y_error, x / x_error)
-    if math.hypot(y, x) <= DRIFT_PX or pull <= 4.0:
+    if math.hypot(y, x) <= DRIFT_PX or pull <= 4.0:  # standard errors
         return None
     return PATTERN_MOVED({"x_px": x, "y_px": y}, where=name)

@@ -131,6 +131,7 @@ def offset_is_wrong(zero: LightZero, gain: GainDiagnosis) -> bool:
         return True
     left = gain.noise_ratio / (1 - zero.share)
     # of the noise that the light has, with an offset that the noise alone tells
+    # of the noise that the light has, with that offset
     return left < 1.1 and not (zero.share > 0 and gain.noise_ratio > 1)
 
 
@@ -180,7 +181,7 @@ def offset_or_gain_finding(
     if (
         gain.shakes
         or gain.noise_counts < 1
-        or abs(share) < 0.03 + 3 * gain.noise_ratio_se
+        or abs(share) < 0.03 + 3 * gain.noise_ratio_se  # of masses, which is not worth a line
         or (zero is not None and not zero.may_be(share))
     ):
         return None
@@ -242,9 +243,10 @@ class Noise:
         Shapes: `chi2` (n,).
         """
         known = chi2[np.isfinite(chi2)]
-        if self.excess is None or len(known) < 10:
+        if self.excess is None or len(known) < 10:  # fits that tell
             return self
         least = float(np.quantile(known, 0.1))  # leave over the noise and no more
+        # small pictures leave over as much by chance
         # small pictures leave over as much by chance
         return Noise() if least < 0.75 * self.excess.ratio else self
 
@@ -359,10 +361,10 @@ def judge_beside(
     pixels = np.column_stack([x.ravel(), y.ravel()])
     frame, places_nm = seen
     count = min(_GAIN_FRAMES, span[1] - span[0])
-    while count >= 8:
+    while count >= 8:  # frames that tell
         near = scipy.spatial.cKDTree(places_nm[(frame >= span[0]) & (frame < span[0] + count)])
         free = used & (near.query(pixels)[0] > away).reshape(used.shape)
-        if free.any() and free.sum() >= 0.25 * used.sum():
+        if free.any() and free.sum() >= 0.25 * used.sum():  # of the pixels, without particles
             counts = movie.read(span[0], span[0] + count)
             additive = context.additive
             if judge_counts(counts, camera, masked=~free, additive=additive).findings:

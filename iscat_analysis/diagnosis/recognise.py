@@ -87,7 +87,7 @@ def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
     one, two, _, four, five = (smooth[block + n, *position] for n in range(_LEAST_BLOCKS))
     change = size[block, *position]
     neighbouring = np.maximum(np.abs(two - one), np.abs(five - four)) / change
-    quiet = np.maximum(4.0 * noise / change, LEAST_STEP_SHARE)
+    quiet = np.maximum(4.0 * noise / change, LEAST_STEP_SHARE)  # standard deviations
     pictures = _pictures(smooth, peaks, _REACH_SIGMAS * spot_px, noise)
     staying = (neighbouring < quiet) & (pictures == 1)
     return Changes(len(peaks), float(staying.mean()), float((pictures > 2).mean()))
@@ -105,6 +105,7 @@ def _pictures(
         seen = smooth[(slice(t, t + _LEAST_BLOCKS), *part)][:, near].astype(np.float64)
         strength = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
         change = np.linalg.norm(seen[_AROUND + 1] - seen[_AROUND - 1])
+        # of noise the second singular value is 1.2, the third 0.9, 1.3 in a fiftieth
         least = max(0.1 * change, 1.5 * noise * math.sqrt(seen.shape[1] / 2))
         count[number] = max(int((strength > least).sum()), 1)
     return count
@@ -128,7 +129,7 @@ def _of_spots(
 
 def _median_deviation(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
     """Median absolute deviation of other − one, on a subsample of pixels."""
-    every = 1 + one.size // 500_000
+    every = 1 + one.size // 500_000  # of so many values a median has an error of a few thousandths
     some = other.ravel()[::every] - one.ravel()[::every]
     deviation = some - middle(some.copy())
     return float(middle(np.abs(deviation, out=deviation)))
@@ -136,7 +137,7 @@ def _median_deviation(one: NDArray[np.floating], other: NDArray[np.floating]) ->
 
 def least_beside(spot_px: float) -> float:
     """Give the smallest share of a change that the pixels next to its centre have."""
-    return 0.5 * math.exp(-0.5 / spot_px**2)
+    return 0.5 * math.exp(-0.5 / spot_px**2)  # half of what the picture has there
 
 
 def spot_of(wavelength_nm: float, na: float, pixel_nm: float) -> float:

@@ -63,6 +63,7 @@ class Stretches:
     def main(self) -> tuple[int, int]:
         """The part that tells of camera, light and optics: the first of those that are long."""
         longest = max(stop - start for start, stop in self.kept)
+        # tells as much as the longest
         return next(span for span in self.kept if span[1] - span[0] >= 0.75 * longest)
 
     def with_jumps(self, frames: Sequence[int]) -> Stretches:
@@ -133,7 +134,7 @@ def _breaks_within(movie: Stack, span: tuple[int, int]) -> Stretches:
         return whole
     groups = [_cells(movie, int(start), int(start) + _READ) for start in starts]
     light = np.array([one.mean() for one in groups])
-    lit = light > 0.5 * float(np.quantile(light, 0.75))
+    lit = light > 0.5 * float(np.quantile(light, 0.75))  # of the usual light
     starts, light = starts[lit], light[lit]
     cells = np.array([one / one.mean() for one, used in zip(groups, lit, strict=True) if used])
     if len(cells) < _FEWEST:
@@ -184,7 +185,7 @@ def _cells(movie: Stack, start: int, stop: int, *, each: bool = False) -> FloatA
     side = max(_SMALLEST, math.ceil(max(rows, columns) / _CELLS))
     high, wide = max(rows // side, 1), max(columns // side, 1)
     tall, broad = min(side, rows), min(side, columns)
-    every = max(1, tall // 16)
+    every = max(1, tall // 16)  # rows of a cell that are read
     placed = movie.in_place(start, stop)
     counts = movie.read(start, stop) if placed is None else placed.counts
     part = counts[:, : high * tall, : wide * broad].reshape(-1, high, tall, wide * broad)
@@ -210,8 +211,9 @@ def _runs(cells: FloatArray) -> list[tuple[int, int]]:
     if not usable.any():
         return []
     change, scatter = change[:, usable], scatter[usable]
-    share = (np.abs(change) > 5.0 * scatter).mean(axis=1)
+    share = (np.abs(change) > 5.0 * scatter).mean(axis=1)  # standard deviations of a cell
     base = float(np.median(share))
+    # of the cells: a change has begun
     begun = share > base + max(0.05, 6 * float(np.median(np.abs(share - base))))
     pattern = seen[:, usable].mean(axis=0)
     contrast = float(np.std(pattern)) or 1.0
@@ -221,12 +223,15 @@ def _runs(cells: FloatArray) -> list[tuple[int, int]]:
         part = change[first:last]
         size = np.sqrt(np.mean(part**2, axis=1)) / contrast
         even = np.mean(part**2, axis=1) ** 2 / np.maximum(np.mean(part**4, axis=1), 1e-300)
+        # of the pattern's contrast
         sudden = (share[first:last] > _STEP_SHARE) & (even > _STEP_EVEN) & (size > 0.1)
         lasting = (
             last - first >= _LASTING
             and float(share[first:last].max()) > base + _LASTING_SHARE
             # of a few bright particles, one after the other, 0.5
+            # of a few bright particles, one after the other, 0.5
             and float(np.sum(share[first:last] - base)) > 0.8
+            # of the pattern's contrast, from one group to the next
             and float(np.median(size)) > 0.05
         )
         if sudden.any() or lasting:
@@ -281,4 +286,5 @@ def _sudden(movie: Stack, start: int, stop: int) -> int | None:
     best = int(np.argmax([
         np.sum((frames[k] - frames[k - 1]) ** 2) for k in range(_READ, len(frames) - _READ + 1)
     ]))  # fmt: skip
+    # of the change, which one frame makes
     return start + _READ + best if sizes[best] > 0.7 * whole else None
