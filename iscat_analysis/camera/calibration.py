@@ -20,7 +20,7 @@ frame, which needs no offset.  Rounding to whole counts is part of the read nois
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -207,24 +207,9 @@ def measure_camera(
             return _from_dark(dark_found, masked, maps)
 
     floor = float(np.median(dark_found.mean)) if dark_found is not None else offset_adu or 0.0
-    found = []
-    for stack in light:
-        first = _glance(stack)
-        odd = masked["hot"] | masked["dead"] | saturated(first.max(axis=0), stack.name)
-        lit = ~(odd | unlike_neighbours(first.mean(axis=0) - floor))
-        measured = moments_of(stack, lit, advance)
-        if dark is None and floor > 0 and np.median(measured.mean) <= floor:
-            raise DataError(
-                f"{stack.name}: has {np.median(measured.mean):.5g} counts, no more than "
-                f"`offset_adu` = {floor:g}: give the counts that the camera has in the dark"
-            )
-        full = saturated(measured.highest, stack.name)
-        masked["saturated"] |= full
-        masked["clipped"] |= clipped(measured.lowest) & (measured.variance > 0)
-        masked["dead"] |= (measured.variance <= 0) & ~full
-        masked["dead"] |= unlike_neighbours(measured.mean - floor, high=math.inf) & ~full
-        masked["hot"] |= unlike_neighbours(measured.mean - floor, low=-math.inf) & ~full
-        found.append(measured)
+    found = [_moments_with_light(stack, floor, masked, advance) for stack in light]
+    if dark is None and floor > 0:
+        _refuse_darker(light, found, floor)
     used = ~np.logical_or.reduce(list(masked.values()))
     if np.count_nonzero(used) < _LEAST_PIXELS:
         raise DataError(
@@ -272,6 +257,33 @@ def measure_camera(
         frames=sum(item.n_frames for item in found),
         notes=tuple(notes),
     )
+
+
+def _moments_with_light(
+    stack: FrameSource, floor: float, masked: dict[str, BoolArray], advance: Callable[[int], None]
+) -> Moments:
+    """Measure the moments of a stack, and add pixels that are not to be used to those masked."""
+    first = _glance(stack)
+    odd = masked["hot"] | masked["dead"] | saturated(first.max(axis=0), stack.name)
+    lit = ~(odd | unlike_neighbours(first.mean(axis=0) - floor))
+    measured = moments_of(stack, lit, advance)
+    full = saturated(measured.highest, stack.name)
+    masked["saturated"] |= full
+    masked["clipped"] |= clipped(measured.lowest) & (measured.variance > 0)
+    masked["dead"] |= (measured.variance <= 0) & ~full
+    masked["dead"] |= unlike_neighbours(measured.mean - floor, high=math.inf) & ~full
+    masked["hot"] |= unlike_neighbours(measured.mean - floor, low=-math.inf) & ~full
+    return measured
+
+
+def _refuse_darker(light: Sequence[FrameSource], found: Sequence[Moments], floor: float) -> None:
+    """Refuse a stack with no more counts than the offset that was given."""
+    for stack, measured in zip(light, found, strict=True):
+        if np.median(measured.mean) <= floor:
+            raise DataError(
+                f"{stack.name}: has {np.median(measured.mean):.5g} counts, no more than "
+                f"`offset_adu` = {floor:g}: give the counts that the camera has in the dark"
+            )
 
 
 def _nothing(frames: int) -> None:

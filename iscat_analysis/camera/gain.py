@@ -251,6 +251,41 @@ def diagnose_gain(
 
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """
+    used, excess, expected, shot = _excess_noise(counts, camera, masked)
+    n_frames = len(counts)
+    kept = _without_outliers(excess / expected, n_frames)
+    excess, expected = excess[kept], expected[kept]
+    ratio = float(excess.sum() / expected.sum())
+    if ratio <= 0:
+        raise DataError(
+            "the gain cannot be measured: the frames are no noisier than camera.read_noise_e "
+            "alone; lower it"
+        )
+    ratio_se = float(np.sqrt(np.sum((excess - ratio * expected) ** 2)) / expected.sum())
+    gain = np.broadcast_to(camera.gain_e_per_adu, counts.shape[1:])[used][kept]
+    configured = float(gain.mean())
+    whole = np.issubdtype(counts.dtype, np.integer)
+    per_count = np.sqrt(np.sum(excess) / (shot * len(excess))) / configured
+    found = GainDiagnosis(
+        noise_ratio=ratio,
+        noise_ratio_se=ratio_se,
+        configured_gain=configured,
+        gain_e_per_adu=configured / ratio,
+        gain_se=configured * ratio_se / ratio**2,
+        n_frames=n_frames,
+        n_pixels=int(np.count_nonzero(kept)),
+        noise_counts=float(per_count) if whole else math.inf,
+    )
+    return with_pattern_jitter(found, counts, camera, masked=~used)
+
+
+def _excess_noise(
+    counts: NDArray[Any], camera: Camera, masked: ArrayLike | None
+) -> tuple[BoolArray, FloatArray, FloatArray, float]:
+    """Sum the terms a_p and b_p of `diagnose_gain` over pairs of frames.
+
+    Returns the pixels that are used (y, x), both sums in these (n,), and the weight of shot noise.
+    """
     n_frames = len(counts)
     if n_frames < 2:
         raise DataError(
@@ -286,31 +321,7 @@ def diagnose_gain(
     read = float(np.sum(1 / power[:-1] ** 2 + 1 / power[1:] ** 2))
     excess = squares - read * camera.dark_variance_e2(counts)[used]
     expected = shot * (1 - float(np.sum(share**2))) * mean
-
-    kept = _without_outliers(excess / expected, n_frames)
-    excess, expected = excess[kept], expected[kept]
-    ratio = float(excess.sum() / expected.sum())
-    if ratio <= 0:
-        raise DataError(
-            "the gain cannot be measured: the frames are no noisier than camera.read_noise_e "
-            "alone; lower it"
-        )
-    ratio_se = float(np.sqrt(np.sum((excess - ratio * expected) ** 2)) / expected.sum())
-    gain = np.broadcast_to(camera.gain_e_per_adu, counts.shape[1:])[used][kept]
-    configured = float(gain.mean())
-    whole = np.issubdtype(counts.dtype, np.integer)
-    per_count = np.sqrt(np.sum(excess) / (shot * len(excess))) / configured
-    found = GainDiagnosis(
-        noise_ratio=ratio,
-        noise_ratio_se=ratio_se,
-        configured_gain=configured,
-        gain_e_per_adu=configured / ratio,
-        gain_se=configured * ratio_se / ratio**2,
-        n_frames=n_frames,
-        n_pixels=int(np.count_nonzero(kept)),
-        noise_counts=float(per_count) if whole else math.inf,
-    )
-    return with_pattern_jitter(found, counts, camera, masked=~used)
+    return used, excess, expected, shot
 
 
 def with_pattern_jitter(

@@ -14,7 +14,8 @@ import mmap
 import struct
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -50,55 +51,58 @@ _CODECS: Mapping[int, Callable[..., Any]] = {
 """What undoes each filter, by its registered number."""
 
 
+@dataclass(frozen=True, eq=False)
 class StoredArray:
-    """A dataset whose bytes were all found in the file; `Hdf5Reader.array` makes it."""
+    """A dataset whose bytes were all found in the file; `Hdf5Reader.array` makes it.
 
-    def __init__(
-        self,
-        data: mmap.mmap,
-        path: Path,
-        name: str,
-        *,
-        shape: tuple[int, ...],
-        stored: np.dtype[Any],
-        chunk: tuple[int, ...],
-        where: NDArray[np.int64],
-        filters: tuple[int, ...],
-    ) -> None:
-        self._data = data
-        self._path = path
-        self._name = name
-        self.shape = shape
-        self._stored = stored
-        self.dtype: np.dtype[Any] = stored.newbyteorder("=")
-        self._chunk = chunk
-        self._chunk_bytes = math.prod(chunk) * stored.itemsize
-        self._grid = tuple(-(-n // c) for n, c in zip(shape, chunk, strict=True))
-        self._where = where
-        self._filters = filters
-        self._slabs = Slabs(self._decoded, shape, self.dtype, chunk[0] if filters else 1)
+    `where` has the place, the length and the filters left out of every chunk, shape (n, 3).
+    """
+
+    data: mmap.mmap
+    path: Path
+    name: str
+    shape: tuple[int, ...]
+    stored: np.dtype[Any]
+    chunk: tuple[int, ...]
+    where: NDArray[np.int64]
+    filters: tuple[int, ...]
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the numbers, in native byte order."""
+        return self.stored.newbyteorder("=")
+
+    @cached_property
+    def _slabs(self) -> Slabs:
+        depth = self.chunk[0] if self.filters else 1
+        return Slabs(self._decoded, self.shape, self.dtype, depth)
+
+    @cached_property
+    def _grid(self) -> tuple[int, ...]:
+        """Chunks along each axis."""
+        return tuple(-(-n // c) for n, c in zip(self.shape, self.chunk, strict=True))
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read rows of the first axis, ``[start, stop)``, as a new array in native byte order."""
-        refuse_changed(self._path, self._data)
+        refuse_changed(self.path, self.data)
         block = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
-        if len(self._where) == 1 and not self._filters:
-            first = int(self._where[0, 0]) + start * math.prod(self.shape[1:]) * self.dtype.itemsize
-            block[:] = np.ndarray(block.shape, self._stored, buffer=self._data, offset=first)
+        if len(self.where) == 1 and not self.filters:
+            first = int(self.where[0, 0]) + start * math.prod(self.shape[1:]) * self.dtype.itemsize
+            block[:] = np.ndarray(block.shape, self.stored, buffer=self.data, offset=first)
             return block
         return self._slabs.read(start, stop)
 
     def _decoded(self, start: int, stop: int) -> NDArray[Any]:
         """Decode the chunks of some rows, each once."""
         block = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
-        depth = self._chunk[0]
+        depth = self.chunk[0]
         first_slab, last_slab = start // depth, -(-stop // depth)
         for place in np.ndindex(max(0, last_slab - first_slab), *self._grid[1:]):
             index = (place[0] + first_slab, *place[1:])
             pixels = self._decode(int(np.ravel_multi_index(index, self._grid)))
             source, target = [], []
             for axis, number in enumerate(index):
-                origin, size = number * self._chunk[axis], self._chunk[axis]
+                origin, size = number * self.chunk[axis], self.chunk[axis]
                 low, high = (start, stop) if axis == 0 else (0, self.shape[axis])
                 begin, end = max(low, origin), min(high, origin + size)
                 source.append(slice(begin - origin, end - origin))
@@ -107,18 +111,19 @@ class StoredArray:
         return block
 
     def _decode(self, number: int) -> NDArray[Any]:
-        start, size, left_out = self._where[number].tolist()
-        raw = self._data[start : start + size]
-        what = f"{self._path}: chunk {number} of {self._name} cannot be decompressed"
+        start, length, left_out = self.where[number].tolist()
+        raw = self.data[start : start + length]
+        size = math.prod(self.chunk) * self.stored.itemsize
+        what = f"{self.path}: chunk {number} of {self.name} cannot be decompressed"
         with damaged(what, remedy="copy the file again or export it again"):
-            for position in reversed(range(len(self._filters))):
+            for position in reversed(range(len(self.filters))):
                 if left_out >> position & 1:
                     continue
-                if self._filters[position] == _SHUFFLE:
-                    raw = np.frombuffer(raw, "u1").reshape(self._stored.itemsize, -1).T.tobytes()
+                if self.filters[position] == _SHUFFLE:
+                    raw = np.frombuffer(raw, "u1").reshape(self.stored.itemsize, -1).T.tobytes()
                 else:
-                    raw = bytes(_CODECS[self._filters[position]](raw, out=self._chunk_bytes))
-            return np.frombuffer(raw, self._stored).reshape(self._chunk)
+                    raw = bytes(_CODECS[self.filters[position]](raw, out=size))
+            return np.frombuffer(raw, self.stored).reshape(self.chunk)
 
 
 class Hdf5Reader:
@@ -269,10 +274,7 @@ class Hdf5Reader:
             where = self._chunks(dataset, name, filters)
         if (where[:, 0] > len(self.data) - where[:, 1]).any():
             raise self._incomplete(name, "its data reach beyond the end of the file")
-        return StoredArray(
-            self.data, self._path, name,
-            shape=shape, stored=dtype, chunk=chunk, where=where, filters=filters,
-        )  # fmt: skip
+        return StoredArray(self.data, self._path, name, shape, dtype, chunk, where, filters)
 
     def _chunks(
         self, dataset: h5py.Dataset, name: str, filters: tuple[int, ...]

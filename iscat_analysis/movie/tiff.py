@@ -257,51 +257,43 @@ _PLAIN = dict.fromkeys(("is_lsm", "is_ndpi", "is_ome", "is_scanimage", "is_stk")
 """Dialects whose images tifffile would guess rather than read."""
 
 
+@dataclass(eq=False)
 class TiffFrames:
     """The frames of a TIFF file; `open_tiff` makes it."""
 
-    def __init__(
-        self,
-        data: mmap.mmap,
-        path: Path,
-        *,
-        dtype: np.dtype[Any],
-        images: Sequence[Image],
-        n_frames: int,
-        metadata: StackMetadata,
-        notes: tuple[str, ...],
-        decode: Callable[..., Any],
-    ) -> None:
-        self._data = data
-        self._path = path
-        self.stored = dtype
-        self._images = images
-        self._decode = decode
-        rows, columns = images[0].shape
-        self.dtype: np.dtype[Any] = dtype.newbyteorder("=")
-        self.shape = (n_frames, rows, columns)
-        self.metadata = metadata
-        self.notes = notes
-        self._starts = self._find_starts(n_frames)
+    data: mmap.mmap
+    path: Path
+    stored: np.dtype[Any]
+    images: Sequence[Image]
+    n_frames: int
+    metadata: StackMetadata
+    notes: tuple[str, ...]
+    decode: Callable[..., Any]
+
+    def __post_init__(self) -> None:
+        self.dtype: np.dtype[Any] = self.stored.newbyteorder("=")
+        rows, columns = self.images[0].shape
+        self.shape = (self.n_frames, rows, columns)
+        self._starts = self._find_starts(self.n_frames)
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames.
 
         Shapes: result (stop − start, y, x).
         """
-        refuse_changed(self._path, self._data)
+        refuse_changed(self.path, self.data)
         block = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
         if self._starts is None:
             for number in range(start, stop):
-                self._decode_into(block[number - start], self._images[number], number)
+                self._decode_into(block[number - start], self.images[number], number)
             return block
         for number, first in enumerate(self._starts[start:stop]):
             block[number] = np.ndarray(
-                self.shape[1:], self.stored, buffer=self._data, offset=int(first)
+                self.shape[1:], self.stored, buffer=self.data, offset=int(first)
             )
         if start < stop:
             used = self._starts[start:stop]
-            release(self._data, int(used.min()), int(used.max()))
+            release(self.data, int(used.min()), int(used.max()))
         return block
 
     @property
@@ -318,24 +310,24 @@ class TiffFrames:
         if np.any(np.diff(self._starts[start:stop]) != size):
             return None
         first = int(self._starts[start])
-        return frames_in_place(self._path, self._data, first, shape, self.stored)
+        return frames_in_place(self.path, self.data, first, shape, self.stored)
 
     def close(self) -> None:
         """Release the file."""
-        unmap(self._data)
+        unmap(self.data)
 
     def _find_starts(self, n_frames: int) -> NDArray[np.int64] | None:
         """First byte of every frame, where all of them lie in the file as they are."""
-        starts = [image.start for image in self._images if image.start is not None]
-        if len(starts) < len(self._images):
+        starts = [image.start for image in self.images if image.start is not None]
+        if len(starts) < len(self.images):
             return None
         size = math.prod(self.shape[1:]) * self.dtype.itemsize
         followers = n_frames - len(starts)  # frames without an image of their own
         end = max(starts) + size * (1 + followers)
-        if end > len(self._data):
+        if end > len(self.data):
             raise DataError(
-                f"{self._path}: is truncated (its {n_frames} frames should reach byte {end} of "
-                f"{len(self._data)}); copy it again or export it again"
+                f"{self.path}: is truncated (its {n_frames} frames should reach byte {end} of "
+                f"{len(self.data)}); copy it again or export it again"
             )
         if followers:
             return starts[0] + size * np.arange(n_frames, dtype=np.int64)
@@ -344,9 +336,9 @@ class TiffFrames:
     def _decode_into(self, frame: NDArray[Any], image: Image, number: int) -> None:
         rows, columns = frame.shape
         for segment, (offset, size) in enumerate(zip(image.offsets, image.sizes, strict=True)):
-            what = f"{self._path}: the pixels of frame {number} cannot be decompressed"
+            what = f"{self.path}: the pixels of frame {number} cannot be decompressed"
             with damaged(what, remedy="copy the file again or export it again"):
-                pixels, place, _ = self._decode(self._data[offset : offset + size], segment)
+                pixels, place, _ = self.decode(self.data[offset : offset + size], segment)
                 top, left = place[2], place[3]
                 tile = pixels[0, : rows - top, : columns - left, 0]
                 frame[top : top + tile.shape[0], left : left + tile.shape[1]] = tile
@@ -442,16 +434,9 @@ def _open(
     resolution = _resolution(file.pages[0])
     hints += [imagej_hints(text, resolution) for text in texts if text.startswith("ImageJ=")]
     hints.append(plain_hints(resolution))
-    return TiffFrames(
-        data,
-        path,
-        dtype=dtype,
-        images=frames,
-        n_frames=n_frames,
-        metadata=merge(hints, path),
-        notes=(*notes, *(note for hint in hints for note in hint.notes)),
-        decode=first.decode,
-    )
+    notes = (*notes, *(note for hint in hints for note in hint.notes))
+    known = merge(hints, path)
+    return TiffFrames(data, path, dtype, frames, n_frames, known, notes, first.decode)
 
 
 def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[Image]:
