@@ -15,8 +15,7 @@ import numpy as np
 from iscat_analysis.config import Config, config_to_toml, refuse_sphere
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.records import PARAMETERS, FloatArray, Progress, Status, silent
-from iscat_analysis.report import atomic_folder, check_output
-from iscat_analysis.report.benchmark import BENCHMARK_NAMES, render_benchmark
+from iscat_analysis.report import BENCHMARK_NAMES, atomic_folder, check_output, render_benchmark
 from iscat_analysis.schemas import to_json
 from iscat_analysis.study import (
     MIN_TRIALS,

@@ -21,13 +21,13 @@ from typing import Any, Literal
 import numpy as np
 import tifffile
 
-from iscat_analysis.bounds.paper import COBRI_ATTENUATION, OPTICS, PARTICLE
+from iscat_analysis.bounds import paper
 from iscat_analysis.config import Config, config_to_toml, parse_config, refuse_sphere
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
 from iscat_analysis.reading import is_file, read_bytes, read_json, toml_of
 from iscat_analysis.records import PARAMETERS, FloatArray, Progress, silent
-from iscat_analysis.report.output import atomic_folder, check_output
+from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.study import Setting, make_setting, trial_generator, write_stack
 
 MANIFEST, TRUTH = "manifest.json", "truth.json"
@@ -382,7 +382,7 @@ def preset_parts(name: str) -> list[Part]:
 
 _SCHEMES: Mapping[str, tuple[float, float]] = {
     "iscat": (1.0, 3e4),
-    "cobri": (COBRI_ATTENUATION, 3e4),
+    "cobri": (paper.COBRI_ATTENUATION, 3e4),
     "darkfield": (1.0, 3e3),
 }
 """Attenuation, and photons per pixel and frame; in dark field those collected per frame."""
@@ -393,13 +393,18 @@ def _of_the_paper(scheme: str, kind: str) -> Part:
     config = _config(
         _PLAIN,
         {
-            "optics": {**OPTICS, "scheme": scheme, "attenuation": attenuation, "focus_nm": 300.0},
+            "optics": {
+                **paper.OPTICS,
+                "scheme": scheme,
+                "attenuation": attenuation,
+                "focus_nm": 300.0,
+            },
             "camera": {"pixel_size_nm": 60.0, "samples_per_pixel": 1},
             "fit": {"mode": "joint", "z_range_nm": [0.0, 250.0]},
             "bounds": {"photons_per_pixel": photons, "n_before": 0, "pixels": 45},
         },
         drop=("particle", "calibration"),
-        particle=PARTICLE if kind == "gold" else _PROTEIN,
+        particle=paper.PARTICLE if kind == "gold" else _PROTEIN,
     )
     about = f"{kind}, {scheme}"
     return Part(f"{kind}_{scheme}", "stacks", config, config, 40, (90.0, 110.0), (0.9, 1.1), about)

@@ -16,7 +16,7 @@ import numpy as np
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ContrastError
 from iscat_analysis.executors import Executor
-from iscat_analysis.fitting.context import AnalysisContext
+from iscat_analysis.fitting import AnalysisContext
 from iscat_analysis.records import PARAMETERS, FloatArray, Progress, silent
 from iscat_analysis.study import (
     OF_DIPOLES,

@@ -12,8 +12,7 @@ from typing import Any
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.files import whole_file
-from iscat_analysis.report import atomic_folder
-from iscat_analysis.report.benchmark import CHALLENGE_NAMES, render_challenge
+from iscat_analysis.report import CHALLENGE_NAMES, atomic_folder, render_challenge
 from iscat_analysis.schemas import to_json
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest that an archive can name: no date is part of a score

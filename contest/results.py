@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.text_tables import read_frame, refuse_twice
+from iscat_analysis.movie import read_frame, refuse_twice
 from iscat_analysis.reading import is_folder
 from iscat_analysis.records import FloatArray
 from iscat_analysis.units import count

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.bounds.paper import PRINTED
+from iscat_analysis.bounds import paper
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.executors import Executor, versions
@@ -198,7 +198,7 @@ def table_1(parts: Mapping[str, Any]) -> list[dict[str, Any]]:
             scheme = group.rpartition("_")[2]
             key = {"x_nm": "x", "y_nm": "y", "mass_kda": "mass"}.get(name, f"z_{scheme}")
             rows.append({
-                "part": group, "parameter": name, "printed": PRINTED.get(key),
+                "part": group, "parameter": name, "printed": paper.PRINTED.get(key),
                 "qcrb": bounds["qcrb"] * unit, "crb": bounds["crb"] * unit,
                 "achieved": {
                     who: entry[name]["rmse"] * unit

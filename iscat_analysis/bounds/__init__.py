@@ -9,6 +9,7 @@ measurement that comes nearest to the light's own bound, and `paper` reproduces 
 
 from __future__ import annotations
 
+from iscat_analysis.bounds import paper
 from iscat_analysis.bounds.classical import (
     EventBounds,
     Unidentifiable,
@@ -106,6 +107,7 @@ __all__ = [
     "natural_bound",
     "optimize",
     "optimize_pupil",
+    "paper",
     "parse_names",
     "parse_scan",
     "parse_target",

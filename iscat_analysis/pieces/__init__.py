@@ -21,6 +21,7 @@ region has its centre at (0, 0) nm.
 from __future__ import annotations
 
 from iscat_analysis.config import CameraConfig as Camera
+from iscat_analysis.pieces.counts import config_of, gather
 from iscat_analysis.pieces.limits import crb, psf, qcrb
 from iscat_analysis.pieces.regions import LogLikelihood, fit_rois, log_likelihood
 from iscat_analysis.pieces.rods import fit_rods
@@ -28,9 +29,11 @@ from iscat_analysis.pieces.rods import fit_rods
 __all__ = [
     "Camera",
     "LogLikelihood",
+    "config_of",
     "crb",
     "fit_rods",
     "fit_rois",
+    "gather",
     "log_likelihood",
     "psf",
     "qcrb",

@@ -16,24 +16,41 @@ from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_outp
 from iscat_analysis.report.tables import event_table, write_posterior, write_tables
 
 if TYPE_CHECKING:
-    from iscat_analysis.report.movie_page import render_report as render_report
-    from iscat_analysis.report.page import render_page as render_page
+    from iscat_analysis.report.benchmark import (
+        BENCHMARK_NAMES,
+        CHALLENGE_NAMES,
+        render_benchmark,
+        render_challenge,
+    )
+    from iscat_analysis.report.movie_page import render_report
+    from iscat_analysis.report.page import render_page
 
 EVENT_FIGURES = 12
 """Events whose images are drawn into the folder, at most."""
 
 __all__ = [
+    "BENCHMARK_NAMES",
+    "CHALLENGE_NAMES",
     "EVENT_FIGURES",
     "OUTPUT_NAMES",
     "atomic_folder",
     "check_output",
     "fill_report",
+    "render_benchmark",
+    "render_challenge",
     "render_page",
     "render_report",
     "write_report",
 ]
 
-_PAGES = {"render_page": "page", "render_report": "movie_page"}
+_PAGES = {
+    "BENCHMARK_NAMES": "benchmark",
+    "CHALLENGE_NAMES": "benchmark",
+    "render_benchmark": "benchmark",
+    "render_challenge": "benchmark",
+    "render_page": "page",
+    "render_report": "movie_page",
+}
 
 
 def __getattr__(name: str) -> Any:

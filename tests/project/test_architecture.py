@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import re
 import subprocess
 import tomllib
@@ -178,3 +179,20 @@ def test_nothing_lies_about_in_the_root() -> None:
     if listed.returncode:
         pytest.skip("no checkout of git")
     assert {line.split("/")[0] for line in listed.stdout.splitlines()} == ROOT_HOLDS
+
+
+def test_the_contest_uses_public_names_of_the_library() -> None:
+    """A name is public in a module above the rooms, or where a room exports it."""
+    hidden = []
+    for path in sorted((ROOT / "contest").glob("*.py")):
+        for node in ast.walk(TREES[path]):
+            if not isinstance(node, ast.ImportFrom) or not node.module:
+                continue
+            package, *inside = node.module.split(".")
+            if package != "iscat_analysis":
+                continue
+            room = importlib.import_module(node.module)
+            offered = getattr(room, "__all__", None) or [n for n in vars(room) if n[0] != "_"]
+            public = set(offered) if len(inside) < 2 else set()
+            hidden += [f"{_where(path, node)} {a.name}" for a in node.names if a.name not in public]
+    assert hidden == []
