@@ -29,8 +29,8 @@ import numpy as np
 from fits import Batch
 from numba import njit
 
-from iscat_analysis._kernels import image, quintics, radial, scoring
-from iscat_analysis._kernels.quintics import evaluate_slopes
+from iscat_analysis._kernels import image, radial, radial_rows, scoring
+from iscat_analysis._kernels.radial_rows import evaluate_slopes
 from iscat_analysis.records import FloatArray
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -209,8 +209,8 @@ def parts(repeats: int) -> dict[str, float]:
     profile = scoring.blank_profile(axial, lens, 2)
     _, stop = scoring.span(lens, pixels, start, axial.heights.shape[3])
     turn = seconds(heights, repeats, axial, start[2], stop, profile)
-    f: FloatArray = np.zeros((20, quintics.padded(SIDE**2)))
-    f[quintics.DISTANCE] = np.linspace(0, stop // radial.POWERS - 1, f.shape[1])
+    f: FloatArray = np.zeros((20, radial_rows.padded(SIDE**2)))
+    f[radial_rows.DISTANCE] = np.linspace(0, stop // radial.POWERS - 1, f.shape[1])
     g = np.zeros((SIDE, 5, SIDE))
     whole = seconds(gradients, repeats, profile, lens, pixels, start, g)
     horner = seconds(strips, repeats, profile, f) * pixels.offsets.size**2

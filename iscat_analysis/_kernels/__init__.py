@@ -9,6 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Set
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from iscat_analysis.errors import ConfigError
 
 try:
@@ -20,6 +23,15 @@ except ValueError as error:  # from an environment variable such as NUMBA_NUM_TH
     ) from None
 
 from iscat_analysis._kernels.kept import Kept, can_be_kept
+
+FloatArray = NDArray[np.float64]
+AnyFloatArray = NDArray[np.floating[Any]]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+ComplexArray = NDArray[np.complex128]
+
+FAST = {"contract", "reassoc", "nsz", "arcp"}
+"""What the compiler may do to the rounding of loops: all but assume that numbers are finite."""
 
 
 def kernel(

@@ -1,9 +1,13 @@
 """Response of the rows of `iscat_analysis._kernels.moving` to a change of their background.
 
-If the logarithm of the background changes by δ, the estimates of rows change by -F⁻¹ G δ.  F is the
+If the logarithm of the background changes by δ, the estimates of rows change by -F⁻¹ G δ, with
+G = w B ∂C the slopes that connect parameters of a row with the pixels of its background.  F is the
 information on all rows of a *cluster*: rows of a frame whose centres lie in one another's squares.
 They must be taken together, because two overlapping rows share the response, and each alone would
 respond to the whole change.
+
+`own_shares`, `send` and `follow` do the same for the rows of one track, row by row for several
+images at once, so that the slopes are read from memory once.
 """
 
 from __future__ import annotations
@@ -13,16 +17,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels import kernel
+from iscat_analysis._kernels import FAST, AnyFloatArray, FloatArray, IntArray, kernel
 from iscat_analysis._kernels.canvas import Light
-from iscat_analysis._kernels.dense import factorise, solve
-from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.lines import copy_line
+from iscat_analysis._kernels.loops import copy_line, factorise, solve
 
-FloatArray = NDArray[np.float64]
 AnyArray = NDArray[Any]
-AnyFloatArray = NDArray[np.floating[Any]]
-IntArray = NDArray[np.int64]
 
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-3, 1.0
 """Damping added to F, relative to its diagonal, for rows that cannot be told apart: the least, and
@@ -284,3 +283,67 @@ def follow_rows(
                 size = (square[1] - square[0]) * (square[3] - square[2])
                 mix(slopes.values[r], slopes.units[r], here, size, seen)
                 put(seen, square, out)
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def own_shares(
+    slopes: Slopes, rows: IntArray, squares: IntArray, weight: FloatArray, out: FloatArray,
+    work: FloatArray, weighted: FloatArray,
+) -> None:  # fmt: skip
+    """Give Gᵀ diag(weight) G of each row: the information that the background takes from it.
+
+    Shapes: `rows` (n,), `squares` (n, 4), `weight` (y, x), `out` (n, k, k), `work, weighted`
+    (side²,).
+    """
+    k = slopes.values.shape[1]
+    for q in range(rows.size):
+        values, units = slopes.values[rows[q]], slopes.units[rows[q]]
+        size = gather(weight, squares[q], work)
+        for a in range(k):
+            slope, unit = values[a], units[a]
+            for j in range(size):
+                weighted[j] = unit * work[j] * slope[j]
+            for b in range(a + 1):
+                out[q, a, b] = out[q, b, a] = units[b] * product(values[b], weighted, size)
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def send(
+    slopes: Slopes, rows: IntArray, squares: IntArray, by: FloatArray, out: FloatArray,
+    work: FloatArray,
+) -> None:  # fmt: skip
+    """Add G times numbers of the rows to images.
+
+    Shapes: `by` (n, b, k), `out` (b, y, x), `work` (side²,).
+    """
+    for q in range(rows.size):
+        values, units, square = slopes.values[rows[q]], slopes.units[rows[q]], squares[q]
+        size = (square[1] - square[0]) * (square[3] - square[2])
+        for v in range(by.shape[1]):
+            mix(values, units, by[q, v], size, work)
+            put(work, square, out[v])
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def follow(
+    slopes: Slopes, rows: IntArray, squares: IntArray, covariance: FloatArray,
+    images: FloatArray, projections: FloatArray, out: FloatArray, work: FloatArray, by: FloatArray,
+) -> None:  # fmt: skip
+    """Give Gᵀ times images for each row, and add G F⁻¹ Gᵀ times these images to `out`.
+
+    Shapes: `covariance` (n, k, k), `images` (b, y, x), `projections` (n, b, k), `out` (b, y, x),
+    `work` (side²,), `by` (k,).
+    """
+    k = slopes.values.shape[1]
+    for q in range(rows.size):
+        values, units, square = slopes.values[rows[q]], slopes.units[rows[q]], squares[q]
+        for v in range(images.shape[0]):
+            size = gather(images[v], square, work)
+            for a in range(k):
+                projections[q, v, a] = units[a] * product(values[a], work, size)
+            for a in range(k):
+                by[a] = 0.0
+                for b in range(k):
+                    by[a] += covariance[q, a, b] * projections[q, v, b]
+            mix(values, units, by, size, work)
+            put(work, square, out[v])

@@ -8,26 +8,20 @@ keeps the sum of all rows of a frame from one fit to the next: if a row moves by
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels import kernel
-from iscat_analysis._kernels.image import Pixels, signal_gradient, signal_image
-from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, LatticeLens, Lens, StampLens
-from iscat_analysis._kernels.lines import copy_line
+from iscat_analysis._kernels import FAST, AnyFloatArray, BoolArray, FloatArray, IntArray, kernel
+from iscat_analysis._kernels.image import signal_gradient, signal_image
+from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, LatticeLens, Lens, Pixels, StampLens
+from iscat_analysis._kernels.loops import copy_line, whole
 from iscat_analysis._kernels.radial import AxialTable, profile_at
 from iscat_analysis._kernels.scoring import span
 from iscat_analysis._kernels.stamp import add_stamp, stamp_gradient
-from iscat_analysis._kernels.whole import whole
 
-FloatArray = NDArray[np.float64]
-AnyFloatArray = NDArray[np.floating[Any]]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 Counts = NDArray[np.uint16] | NDArray[np.float32]
 """Types of counts; kernels are compiled for the type of the movie."""
 
@@ -64,6 +58,14 @@ class Field(NamedTuple):
     drawn: int
     slack: FloatArray
     alike: bool
+
+
+class Rows(NamedTuple):
+    """Particles in frames: where each frame begins (t + 1,), their θ (n, 5) and blurs (n,)."""
+
+    starts: IntArray
+    theta: FloatArray
+    group: IntArray
 
 
 class Canvas(NamedTuple):
@@ -161,7 +163,10 @@ def draw_gradient(
     pictures: Pictures, group: int, theta: FloatArray, pixels: Pixels,
     profile: FloatArray, out: AnyFloatArray,
 ) -> None:  # fmt: skip
-    """Fill `out` (ny, 5, nx) with the signal of one row and its gradient."""
+    """Fill `out` (ny, 5, nx) with the signal of one row and its gradient.
+
+    At one height (ny, BENDS, nx) asks for second derivatives as well.
+    """
     table, lens = table_of(pictures, group), lens_of(pictures, group)
     _draw_gradient(table, lens, pictures.nodes, theta, pixels, profile, out)
 
@@ -221,31 +226,28 @@ def stage(
 
 @kernel(_nrt=False)
 def draw_frames(
-    field: Field, near: Pictures, far: Pictures, starts: IntArray, first: int, last: int,
-    theta: FloatArray, group: IntArray, canvas: Canvas, near_profile: FloatArray,
-    far_profile: FloatArray, image: FloatArray,
+    field: Field, near: Pictures, far: Pictures, rows: Rows, first: int, last: int, canvas: Canvas,
+    near_profile: FloatArray, far_profile: FloatArray, image: FloatArray,
 ) -> None:  # fmt: skip
     """Update frames first…last − 1 of the canvas to the current rows.
 
-    Shapes: `starts` (t + 1,), `theta` (rows, 5), `group` (rows,), `image` (side²,).
+    Shapes: `image` (side²,).
     """
     for t in range(first, last):
-        _ready_frame(
-            field, near, far, starts, t, theta, group, canvas, near_profile, far_profile, image
-        )
+        _ready_frame(field, near, far, rows, t, canvas, near_profile, far_profile, image)
 
 
 @kernel(_nrt=False)
 def _ready_frame(
-    field: Field, near: Pictures, far: Pictures, starts: IntArray, t: int, theta: FloatArray,
-    group: IntArray, canvas: Canvas, near_profile: FloatArray,
-    far_profile: FloatArray, image: FloatArray,
+    field: Field, near: Pictures, far: Pictures, particles: Rows, t: int, canvas: Canvas,
+    near_profile: FloatArray, far_profile: FloatArray, image: FloatArray,
 ) -> None:  # fmt: skip
     """Update a frame of the canvas to the current rows.
 
     If rows have moved too far from their rings, these rings are drawn again: those of these rows
     only, or those of all rows if this is faster.
     """
+    starts, theta, group = particles
     total = canvas.total[t]
     rows, columns = total.shape
     first, last = starts[t], starts[t + 1]

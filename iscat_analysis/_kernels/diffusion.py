@@ -9,13 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from iscat_analysis._kernels import kernel
-from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.lines import largest
-
-FloatArray = NDArray[np.float64]
+from iscat_analysis._kernels import FAST, FloatArray, kernel
+from iscat_analysis._kernels.loops import largest
 
 LOG_2PI = math.log(2.0 * math.pi)
 

@@ -8,14 +8,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from iscat_analysis._kernels import kernel
+from iscat_analysis._kernels import FAST, FloatArray, kernel
 from iscat_analysis._kernels.diffusion import LOG_2PI, TOGETHER
-from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.lines import copy_line, largest
-
-FloatArray = NDArray[np.float64]
+from iscat_analysis._kernels.loops import copy_line, largest
 
 _SHORT = 1e-2  # stiffness times exposure below which the moments are computed from a series
 _STIFFNESSES = 10  # number of stiffnesses among which the search begins

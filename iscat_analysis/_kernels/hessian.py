@@ -1,28 +1,31 @@
-"""Second derivatives of the signal, for the observed information, some rows of pixels at a time.
+"""Second derivatives of the signal, the observed information and the bias that follow from them.
 
 With the field e and D = (1/r)∂/∂r, a radial function F has
 
     ∂u F = u DF,   ∂uu F = DF + (F″ − DF) u²/r²,   ∂uv F = (F″ − DF) uv/r²,
 
-so that one loop over the pixels of a few rows evaluates the quintics, their slopes and their second
-derivatives (`iscat_analysis._kernels.quintics`), and another contracts them to
+so that one loop over the pixels of a strip evaluates the quintics, their slopes and their second
+derivatives, and another makes of them a component of the field with its derivatives in (u, v, z).
+These are real and imaginary parts e of which each has, with ρ only in the first,
 
-    ∂i∂j s = Re[g* ∂ij e_u + h* ∂ij e_v] + 2a² Re Σ ∂i e* ∂j e,   g = 2aρ + 2a² e_u,   h = 2a² e_v.
+    s = 2aρ e + a² e²,   ∂i s = g ∂i e,   ∂ij s = g ∂ij e + 2a² ∂i e ∂j e,   g = 2aρ + 2a² e.
+
+`rows` has shape (ny, `ROWS`, nx): s, its gradient in (x, y, z, a) and its second derivatives, as
+`signal_hessian` fills it.  Data and parameters are those of `iscat_analysis._kernels.noise`.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from iscat_analysis._kernels import kernel
-from iscat_analysis._kernels.image import Pixels
-from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.lattice_rows import lattice_fields
-from iscat_analysis._kernels.lens import LATTICE, LatticeLens, Lens, RoundLens
-from iscat_analysis._kernels.quintics import DISTANCE, evaluate_bends, evaluate_last_slopes
-
-FloatArray = NDArray[np.float64]
+from iscat_analysis._kernels import FAST, BoolArray, FloatArray, kernel
+from iscat_analysis._kernels.lattice import BENT, lattice_waves
+from iscat_analysis._kernels.lens import LATTICE, LatticeLens, Lens, Pixels, RoundLens
+from iscat_analysis._kernels.loops import factorise, marked
+from iscat_analysis._kernels.noise import FLOOR, bias_of_pixel, curvature_of_row
+from iscat_analysis._kernels.radial import AxialTable, profile_at
+from iscat_analysis._kernels.radial_rows import DISTANCE, evaluate_bends, evaluate_last_slopes
+from iscat_analysis._kernels.scoring import blank_profile, image_score, span
 
 ROWS = 15
 """Numbers for each pixel: s, its derivatives in (x, y, z, a), and its second derivatives."""
@@ -33,51 +36,38 @@ PAIRS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3),
 _CHANNELS = 4  # of the first order of a radial profile
 _FIELDS = 12  # rows of scratch: four channels, their slopes and second derivatives
 _DISTANCE = _FIELDS + DISTANCE  # after as many of ∂z, ∂zz and slopes of ∂z
-_DX, _DY, _SUMS = _DISTANCE + 1, _DISTANCE + 2, _DISTANCE + 3
+_DX, _DY, _WAVES = _DISTANCE + 1, _DISTANCE + 2, _DISTANCE + 3
+_SUMS = _WAVES + 2 * BENT
 _STRIP = 64  # pixels; with a fixed number the compiler knows that lines of scratch do not overlap
 _NEAR = 1e-6  # of a step: here DF is F″
 
 
 @kernel()
 def signal_hessian(
-    profile: FloatArray,
-    lens: Lens,
-    pixels: Pixels,
-    x_p: float,
-    y_p: float,
-    amplitude: float,
-    out: FloatArray,
-) -> None:
+    profile: FloatArray, lens: RoundLens | LatticeLens, pixels: Pixels, x_p: float, y_p: float,
+    amplitude: float, out: FloatArray,
+) -> None:  # fmt: skip
     """Signal, gradient and second derivatives on a pixel grid, averaged over the samples.
 
     Shapes: `out` (ny, ROWS, nx).
     """
-    if len(lens) == LATTICE:
-        _lattice_hessian(profile, lens, pixels, x_p, y_p, amplitude, out)
-        return
-    nx, offsets, weights = pixels.x.size, pixels.offsets, pixels.weights
+    offsets, weights = pixels.offsets, pixels.weights
     flat = np.empty((_SUMS + ROWS) * _STRIP)
     f = flat.reshape(_SUMS + ROWS, _STRIP)
-    fields, sums = f[_FIELDS:], f[_SUMS:]
-    for first in range(0, pixels.y.size * nx, _STRIP):
+    cos, sin = (1.0, 0.0) if len(lens) == LATTICE else (lens.cos_psi, lens.sin_psi)
+    for first in range(0, pixels.y.size * pixels.x.size, _STRIP):
         for j in range(_SUMS * _STRIP, flat.size):
             flat[j] = 0.0
         for i in range(offsets.size):
             for k in range(offsets.size):
-                _place(lens.inv_step, pixels, first, x_p - offsets[k], y_p - offsets[i], f)
-                evaluate_bends(profile, f)
-                _bend(lens, amplitude, weights[i] * weights[k], flat)
-                if profile.shape[2] > _CHANNELS:
-                    evaluate_last_slopes(profile, fields)
-                    _bend_z(lens, amplitude, weights[i] * weights[k], flat)
-        _copy(sums, first, out)
+                _place(pixels, first, x_p - offsets[k], y_p - offsets[i], f)
+                _add_derivatives(profile, lens, amplitude, weights[i] * weights[k], f)
+        _copy(f[_SUMS:], cos, sin, first, out)
 
 
 @kernel()
-def _place(
-    inv_step: float, pixels: Pixels, first: int, x_p: float, y_p: float, f: FloatArray
-) -> None:
-    """Fill distances and positions of a strip from pixel `first` on; beyond the last with 0."""
+def _place(pixels: Pixels, first: int, x_p: float, y_p: float, f: FloatArray) -> None:
+    """Fill the positions of a strip from pixel `first` on; beyond the last with 0."""
     dx, dy, nx = f[_DX], f[_DY], pixels.x.size
     row, column = first // nx, first % nx
     for j in range(_STRIP):
@@ -87,51 +77,41 @@ def _place(
         column += 1
         if column == nx:
             row, column = row + 1, 0
+
+
+@kernel()
+def _add_derivatives(
+    profile: FloatArray,
+    lens: RoundLens | LatticeLens,
+    amplitude: float,
+    weight: float,
+    f: FloatArray,
+) -> None:
+    """Add weight × signal and derivatives of a strip, one component of the field after another."""
+    if len(lens) == LATTICE:
+        for c in range(lens.components):
+            lattice_waves(profile, lens, c, f[_DX], f[_DY], f[_WAVES:])
+            _contract(lens.rho if c == 0 else 0.0, amplitude, weight, f.reshape(f.size))
+        return
+    dx, dy = f[_DX], f[_DY]
     for j in range(_STRIP):
-        f[_DISTANCE, j] = f[DISTANCE, j] = np.sqrt(dx[j] * dx[j] + dy[j] * dy[j]) * inv_step
-
-
-@kernel()
-def _copy(sums: FloatArray, first: int, out: FloatArray) -> None:
-    """Fill the pixels of `out` (ny, ROWS, nx) from `first` on with a strip of sums."""
-    ny, _, nx = out.shape
-    row, column, begin = first // nx, first % nx, 0
-    while begin < _STRIP and row < ny:
-        end = begin + min(nx - column, _STRIP - begin)
-        for k in range(ROWS):
-            here, there = sums[k, begin:end], out[row, k, column : column + end - begin]
-            for j in range(here.size):
-                there[j] = here[j]
-        row, column, begin = row + 1, 0, end
-
-
-@kernel()
-def _lattice_hessian(
-    profile: FloatArray, lens: LatticeLens, pixels: Pixels, x_p: float, y_p: float,
-    amplitude: float, out: FloatArray,
-) -> None:  # fmt: skip
-    """Do the same as `signal_hessian` with a lattice."""
-    out[:] = 0.0
-    offsets, weights = pixels.offsets, pixels.weights
-    count = lens.components
-    e = np.empty(count, dtype=np.complex128)
-    de = np.empty((3, count), dtype=np.complex128)
-    dde = np.empty((3, 3, count), dtype=np.complex128)
-    for row in range(pixels.y.size):
-        for i in range(offsets.size):
-            dy = pixels.y[row] + offsets[i] - y_p
-            for k in range(offsets.size):
-                x, weight = x_p - offsets[k], weights[i] * weights[k]
-                for j in range(pixels.x.size):
-                    lattice_fields(profile, lens, pixels.x[j] - x, dy, e, de, dde)
-                    _contract(lens.rho, amplitude, weight, e, de, dde, out[row], j)
+        f[_DISTANCE, j] = f[DISTANCE, j] = np.sqrt(dx[j] * dx[j] + dy[j] * dy[j]) * lens.inv_step
+    evaluate_bends(profile, f)
+    if profile.shape[2] > _CHANNELS:
+        evaluate_last_slopes(profile, f[_FIELDS:])
+    else:
+        f[_FIELDS:_DISTANCE] = 0.0
+    flat = f.reshape(f.size)
+    _divide(lens.inv_step, flat)
+    _bend(lens, 1.0, lens.co, 0.0, 0.0, flat)
+    _contract(lens.rho, amplitude, weight, flat)
+    _bend(lens, 0.0, 0.0, lens.cross, lens.ring, flat)
+    _contract(0.0, amplitude, weight, flat)
 
 
 @kernel(fastmath=FAST)
-def _bend(lens: RoundLens, amplitude: float, weight: float, f: FloatArray) -> None:
-    """Add weight × all terms without a derivative in z; keep DF (4 to 7 in f) and (F″ − DF)/r²."""
-    inv_step, rho, cos, sin = lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi
-    co, cross, ring, a = lens.co, lens.cross, lens.ring, amplitude
+def _divide(inv_step: float, f: FloatArray) -> None:
+    """Make of slopes and second derivatives of a strip's radial functions DF and (F″ − DF)/r²."""
     square = inv_step * inv_step
     for j in range(_STRIP):
         t = f[_DISTANCE * _STRIP + j]
@@ -142,156 +122,301 @@ def _bend(lens: RoundLens, amplitude: float, weight: float, f: FloatArray) -> No
             once = square * f[(8 + k) * _STRIP + j] if near else per * f[(4 + k) * _STRIP + j]
             f[(8 + k) * _STRIP + j] = (square * f[(8 + k) * _STRIP + j] - once) * per_r2
             f[(4 + k) * _STRIP + j] = once
-    for j in range(_STRIP):
-        dx, dy = f[_DX * _STRIP + j], f[_DY * _STRIP + j]
-        u, v = cos * dx + sin * dy, cos * dy - sin * dx
-        uu, vv, uv = u * u, v * v, u * v
-        c2, s2 = co * (uu - vv), cross * 2 * uv + ring * (uu + vv)
-        s2_u, s2_v = 2 * (cross * v + ring * u), 2 * (cross * u + ring * v)
-        n_r, n_i = f[2 * _STRIP + j], f[3 * _STRIP + j]
-        m_r, m_i = f[6 * _STRIP + j], f[7 * _STRIP + j]
-        e_r, e_i = f[0 * _STRIP + j] + n_r * c2, f[1 * _STRIP + j] + n_i * c2
-        h_r, h_i = n_r * s2, n_i * s2
-        p_r, p_i = f[4 * _STRIP + j] + m_r * c2, f[5 * _STRIP + j] + m_i * c2
-        b_r, b_i = (
-            f[8 * _STRIP + j] + f[10 * _STRIP + j] * c2,
-            f[9 * _STRIP + j] + f[11 * _STRIP + j] * c2,
-        )
-        d_r, d_i = f[10 * _STRIP + j] * s2, f[11 * _STRIP + j] * s2
-        # first derivatives of e_u and e_v along u and v
-        eu_r, eu_i = p_r * u + 2 * co * u * n_r, p_i * u + 2 * co * u * n_i
-        ev_r, ev_i = p_r * v - 2 * co * v * n_r, p_i * v - 2 * co * v * n_i
-        hu_r, hu_i = m_r * s2 * u + n_r * s2_u, m_i * s2 * u + n_i * s2_u
-        hv_r, hv_i = m_r * s2 * v + n_r * s2_v, m_i * s2 * v + n_i * s2_v
-        # second derivatives
-        euu_r = p_r + b_r * uu + 4 * co * uu * m_r + 2 * co * n_r
-        euu_i = p_i + b_i * uu + 4 * co * uu * m_i + 2 * co * n_i
-        evv_r = p_r + b_r * vv - 4 * co * vv * m_r - 2 * co * n_r
-        evv_i = p_i + b_i * vv - 4 * co * vv * m_i - 2 * co * n_i
-        euv_r, euv_i = b_r * uv, b_i * uv
-        common = s2 + 2 * u * s2_u
-        huu_r = m_r * common + d_r * uu + 2 * ring * n_r
-        huu_i = m_i * common + d_i * uu + 2 * ring * n_i
-        common = s2 + 2 * v * s2_v
-        hvv_r = m_r * common + d_r * vv + 2 * ring * n_r
-        hvv_i = m_i * common + d_i * vv + 2 * ring * n_i
-        common = u * s2_v + v * s2_u
-        huv_r = m_r * common + d_r * uv + 2 * cross * n_r
-        huv_i = m_i * common + d_i * uv + 2 * cross * n_i
-        k_r, k_i, q = 2 * a * (rho + a * e_r), 2 * a * a * e_i, 2 * a * a
-        l_r, l_i = q * h_r, q * h_i
-        s_u = k_r * eu_r + k_i * eu_i + l_r * hu_r + l_i * hu_i
-        s_v = k_r * ev_r + k_i * ev_i + l_r * hv_r + l_i * hv_i
-        s_uu = k_r * euu_r + k_i * euu_i + l_r * huu_r + l_i * huu_i
-        s_uu += q * (eu_r * eu_r + eu_i * eu_i + hu_r * hu_r + hu_i * hu_i)
-        s_vv = k_r * evv_r + k_i * evv_i + l_r * hvv_r + l_i * hvv_i
-        s_vv += q * (ev_r * ev_r + ev_i * ev_i + hv_r * hv_r + hv_i * hv_i)
-        s_uv = k_r * euv_r + k_i * euv_i + l_r * huv_r + l_i * huv_i
-        s_uv += q * (eu_r * ev_r + eu_i * ev_i + hu_r * hv_r + hu_i * hv_i)
-        g_r, g_i, w = 2 * rho + 4 * a * e_r, 4 * a * e_i, 4 * a
-        a_u = g_r * eu_r + g_i * eu_i + w * (h_r * hu_r + h_i * hu_i)
-        a_v = g_r * ev_r + g_i * ev_i + w * (h_r * hv_r + h_i * hv_i)
-        power = e_r * e_r + e_i * e_i + h_r * h_r + h_i * h_i
-        f[(_SUMS + 0) * _STRIP + j] += weight * a * (2 * rho * e_r + a * power)
-        f[(_SUMS + 1) * _STRIP + j] += weight * (sin * s_v - cos * s_u)
-        f[(_SUMS + 2) * _STRIP + j] -= weight * (sin * s_u + cos * s_v)
-        f[(_SUMS + 4) * _STRIP + j] += weight * (2 * rho * e_r + 2 * a * power)
-        f[(_SUMS + 5) * _STRIP + j] += weight * (
-            cos * cos * s_uu - 2 * cos * sin * s_uv + sin * sin * s_vv
-        )
-        f[(_SUMS + 6) * _STRIP + j] += weight * (
-            cos * sin * (s_uu - s_vv) + (cos * cos - sin * sin) * s_uv
-        )
-        f[(_SUMS + 7) * _STRIP + j] += weight * (
-            sin * sin * s_uu + 2 * cos * sin * s_uv + cos * cos * s_vv
-        )
-        f[(_SUMS + 11) * _STRIP + j] += weight * (sin * a_v - cos * a_u)
-        f[(_SUMS + 12) * _STRIP + j] -= weight * (sin * a_u + cos * a_v)
-        f[(_SUMS + 14) * _STRIP + j] += weight * 2 * power
+            f[(20 + k) * _STRIP + j] *= square / (t + 1e-30)
 
 
 @kernel(fastmath=FAST)
-def _bend_z(lens: RoundLens, amplitude: float, weight: float, f: FloatArray) -> None:
-    """Add weight × the derivatives in z, after `_bend`."""
-    inv_step, rho, cos, sin = lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi
-    co, cross, ring, a = lens.co, lens.cross, lens.ring, amplitude
-    square = inv_step * inv_step
+def _bend(
+    lens: RoundLens, plain: float, co: float, cross: float, ring: float, f: FloatArray
+) -> None:
+    """Fill a component, plain F0 + F2 c, with c = co (u² − v²) + 2 cross uv + ring (u² + v²)."""
+    cos, sin = lens.cos_psi, lens.sin_psi
+    c_uu, c_vv, c_uv = 2 * (ring + co), 2 * (ring - co), 2 * cross
     for j in range(_STRIP):
         dx, dy = f[_DX * _STRIP + j], f[_DY * _STRIP + j]
         u, v = cos * dx + sin * dy, cos * dy - sin * dx
-        uu, vv = u * u, v * v
-        c2, s2 = co * (uu - vv), cross * 2 * u * v + ring * (uu + vv)
-        s2_u, s2_v = 2 * (cross * v + ring * u), 2 * (cross * u + ring * v)
-        n_r, n_i = f[2 * _STRIP + j], f[3 * _STRIP + j]
-        e_r, e_i = f[0 * _STRIP + j] + n_r * c2, f[1 * _STRIP + j] + n_i * c2
-        h_r, h_i = n_r * s2, n_i * s2
-        p_r, p_i = (
-            f[4 * _STRIP + j] + f[6 * _STRIP + j] * c2,
-            f[5 * _STRIP + j] + f[7 * _STRIP + j] * c2,
-        )
-        eu_r, eu_i = p_r * u + 2 * co * u * n_r, p_i * u + 2 * co * u * n_i
-        ev_r, ev_i = p_r * v - 2 * co * v * n_r, p_i * v - 2 * co * v * n_i
-        hu_r = f[6 * _STRIP + j] * s2 * u + n_r * s2_u
-        hu_i = f[7 * _STRIP + j] * s2 * u + n_i * s2_u
-        hv_r = f[6 * _STRIP + j] * s2 * v + n_r * s2_v
-        hv_i = f[7 * _STRIP + j] * s2 * v + n_i * s2_v
-        per = square / (f[_DISTANCE * _STRIP + j] + 1e-30)
-        n_r, n_i = f[14 * _STRIP + j], f[15 * _STRIP + j]
-        m_r, m_i = per * f[22 * _STRIP + j], per * f[23 * _STRIP + j]
-        z_r, z_i = f[12 * _STRIP + j] + n_r * c2, f[13 * _STRIP + j] + n_i * c2
-        y_r, y_i = n_r * s2, n_i * s2
-        p_r, p_i = per * f[20 * _STRIP + j] + m_r * c2, per * f[21 * _STRIP + j] + m_i * c2
-        zu_r, zu_i = p_r * u + 2 * co * u * n_r, p_i * u + 2 * co * u * n_i
-        zv_r, zv_i = p_r * v - 2 * co * v * n_r, p_i * v - 2 * co * v * n_i
-        yu_r, yu_i = m_r * s2 * u + n_r * s2_u, m_i * s2 * u + n_i * s2_u
-        yv_r, yv_i = m_r * s2 * v + n_r * s2_v, m_i * s2 * v + n_i * s2_v
-        k_r, k_i, q = 2 * a * (rho + a * e_r), 2 * a * a * e_i, 2 * a * a
-        l_r, l_i = q * h_r, q * h_i
-        s_uz = k_r * zu_r + k_i * zu_i + l_r * yu_r + l_i * yu_i
-        s_uz += q * (eu_r * z_r + eu_i * z_i + hu_r * y_r + hu_i * y_i)
-        s_vz = k_r * zv_r + k_i * zv_i + l_r * yv_r + l_i * yv_i
-        s_vz += q * (ev_r * z_r + ev_i * z_i + hv_r * y_r + hv_i * y_i)
-        s_zz = k_r * (f[16 * _STRIP + j] + f[18 * _STRIP + j] * c2) + k_i * (
-            f[17 * _STRIP + j] + f[19 * _STRIP + j] * c2
-        )
-        s_zz += (l_r * f[18 * _STRIP + j] + l_i * f[19 * _STRIP + j]) * s2
-        s_zz += q * (z_r * z_r + z_i * z_i + y_r * y_r + y_i * y_i)
-        g_r, g_i, w = 2 * rho + 4 * a * e_r, 4 * a * e_i, 4 * a
-        f[(_SUMS + 3) * _STRIP + j] += weight * (k_r * z_r + k_i * z_i + l_r * y_r + l_i * y_i)
-        f[(_SUMS + 8) * _STRIP + j] += weight * (sin * s_vz - cos * s_uz)
-        f[(_SUMS + 9) * _STRIP + j] -= weight * (sin * s_uz + cos * s_vz)
-        f[(_SUMS + 10) * _STRIP + j] += weight * s_zz
-        f[(_SUMS + 13) * _STRIP + j] += weight * (
-            g_r * z_r + g_i * z_i + w * (h_r * y_r + h_i * y_i)
-        )
+        c_u, c_v = c_uu * u + c_uv * v, c_vv * v + c_uv * u
+        c = 0.5 * (c_u * u + c_v * v)
+        for part in range(2):
+            f0, f2 = f[part * _STRIP + j], f[(2 + part) * _STRIP + j]
+            d0, d2 = f[(4 + part) * _STRIP + j], f[(6 + part) * _STRIP + j]
+            b0, b2 = f[(8 + part) * _STRIP + j], f[(10 + part) * _STRIP + j]
+            z0, z2 = f[(12 + part) * _STRIP + j], f[(14 + part) * _STRIP + j]
+            y0, y2 = f[(20 + part) * _STRIP + j], f[(22 + part) * _STRIP + j]
+            p, b, y = plain * d0 + d2 * c, plain * b0 + b2 * c, plain * y0 + y2 * c
+            here = (_WAVES + BENT * part) * _STRIP + j
+            f[here] = plain * f0 + f2 * c
+            f[here + _STRIP] = p * u + f2 * c_u
+            f[here + 2 * _STRIP] = p * v + f2 * c_v
+            f[here + 3 * _STRIP] = plain * z0 + z2 * c
+            f[here + 4 * _STRIP] = p + b * u * u + 2 * d2 * u * c_u + f2 * c_uu
+            f[here + 5 * _STRIP] = b * u * v + d2 * (u * c_v + v * c_u) + f2 * c_uv
+            f[here + 6 * _STRIP] = p + b * v * v + 2 * d2 * v * c_v + f2 * c_vv
+            f[here + 7 * _STRIP] = y * u + z2 * c_u
+            f[here + 8 * _STRIP] = y * v + z2 * c_v
+            f[here + 9 * _STRIP] = (
+                plain * f[(16 + part) * _STRIP + j] + f[(18 + part) * _STRIP + j] * c
+            )
+
+
+@kernel(fastmath=FAST)
+def _contract(rho: float, a: float, weight: float, f: FloatArray) -> None:
+    """Add weight × signal and derivatives of one component of the field to the sums of a strip."""
+    square = 2 * a * a
+    for j in range(_STRIP):
+        for part in range(2):
+            ref = 2 * rho if part == 0 else 0.0
+            here, there = (_WAVES + BENT * part) * _STRIP + j, _SUMS * _STRIP + j
+            e, u, v, z = f[here], f[here + _STRIP], f[here + 2 * _STRIP], f[here + 3 * _STRIP]
+            g, h = weight * a * (ref + 2 * a * e), weight * (ref + 4 * a * e)
+            q = weight * square
+            f[there] += weight * a * e * (ref + a * e)
+            f[there + _STRIP] += g * u
+            f[there + 2 * _STRIP] += g * v
+            f[there + 3 * _STRIP] += g * z
+            f[there + 4 * _STRIP] += weight * e * (ref + 2 * a * e)
+            f[there + 5 * _STRIP] += g * f[here + 4 * _STRIP] + q * u * u
+            f[there + 6 * _STRIP] += g * f[here + 5 * _STRIP] + q * u * v
+            f[there + 7 * _STRIP] += g * f[here + 6 * _STRIP] + q * v * v
+            f[there + 8 * _STRIP] += g * f[here + 7 * _STRIP] + q * u * z
+            f[there + 9 * _STRIP] += g * f[here + 8 * _STRIP] + q * v * z
+            f[there + 10 * _STRIP] += g * f[here + 9 * _STRIP] + q * z * z
+            f[there + 11 * _STRIP] += h * u
+            f[there + 12 * _STRIP] += h * v
+            f[there + 13 * _STRIP] += h * z
+            f[there + 14 * _STRIP] += 2 * weight * e * e
 
 
 @kernel()
-def _contract(
-    rho: float,
-    a: float,
-    weight: float,
-    e: NDArray[np.complex128],
-    de: NDArray[np.complex128],
-    dde: NDArray[np.complex128],
-    out: FloatArray,
-    column: int,
+def _copy(sums: FloatArray, cos: float, sin: float, first: int, out: FloatArray) -> None:
+    """Fill the pixels of `out` (ny, ROWS, nx) from `first` on with a strip of sums.
+
+    Derivatives along (u, v) become those along (x, y) of the particle, which moves against them.
+    """
+    ny, _, nx = out.shape
+    for j in range(min(_STRIP, ny * nx - first)):
+        here, s = out[(first + j) // nx, :, (first + j) % nx], sums[:, j]
+        for k in range(ROWS):
+            here[k] = s[k]
+        for k in (1, 8, 11):
+            here[k], here[k + 1] = sin * s[k + 1] - cos * s[k], -sin * s[k] - cos * s[k + 1]
+        here[5] = cos * cos * s[5] - 2 * cos * sin * s[6] + sin * sin * s[7]
+        here[6] = cos * sin * (s[5] - s[7]) + (cos * cos - sin * sin) * s[6]
+        here[7] = sin * sin * s[5] + 2 * cos * sin * s[6] + cos * cos * s[7]
+
+
+@kernel()
+def derivatives_between(
+    axial: AxialTable, lens: Lens, pixels: Pixels, theta: FloatArray, rows: FloatArray
 ) -> None:
-    """Add weight × signal and derivatives of one point, whose field is known along x and y."""
-    for c in range(e.size):
-        ref = 2 * rho if c == 0 else 0.0
-        power = e[c].real ** 2 + e[c].imag ** 2
-        out[0, column] += weight * a * (ref * e[c].real + a * power)
-        out[4, column] += weight * (ref * e[c].real + 2 * a * power)
-        out[14, column] += weight * 2 * power
-        k = 5
-        for j in range(3):
-            sign = weight if j == 2 else -weight  # the particle moves, not the camera
-            cross = (np.conj(e[c]) * de[j, c]).real
-            out[1 + j, column] += sign * a * (ref * de[j, c].real + 2 * a * cross)
-            out[11 + j, column] += sign * (ref * de[j, c].real + 4 * a * cross)
-            for i in range(j + 1):
-                both = (np.conj(de[i, c]) * de[j, c] + np.conj(e[c]) * dde[i, j, c]).real
-                second = a * ref * dde[i, j, c].real + 2 * a * a * both
-                out[k, column] += (-weight if j == 2 and i < 2 else weight) * second
-                k += 1
+    """Fill `rows` at a height between those of a table."""
+    profile = blank_profile(axial, lens, 3)
+    start, stop = span(lens, pixels, theta, axial.heights.shape[3])
+    profile_at(axial, theta[2], start, stop, profile)
+    signal_hessian(profile, lens, pixels, theta[0], theta[1], theta[3], rows)
+
+
+@kernel(fastmath=FAST)
+def _weighted(t: FloatArray, a: FloatArray) -> float:
+    """Scalar product, shape (nx,) each."""
+    total = 0.0
+    for j in range(t.size):
+        total += t[j] * a[j]
+    return total
+
+
+@kernel(fastmath=FAST)
+def _products(t: FloatArray, g: FloatArray, sums: FloatArray) -> None:
+    """Add Σ t g_i g_j to `sums` (10) in the order of `PAIRS`; g holds s and its gradient."""
+    f00 = f01 = f11 = f02 = f12 = f22 = f03 = f13 = f23 = f33 = 0.0
+    for j in range(t.size):
+        g0, g1, g2, g3 = g[1, j], g[2, j], g[3, j], g[4, j]
+        h0, h1, h2, h3 = t[j] * g0, t[j] * g1, t[j] * g2, t[j] * g3
+        f00 += h0 * g0
+        f01 += h0 * g1
+        f11 += h1 * g1
+        f02 += h0 * g2
+        f12 += h1 * g2
+        f22 += h2 * g2
+        f03 += h0 * g3
+        f13 += h1 * g3
+        f23 += h2 * g3
+        f33 += h3 * g3
+    sums[0] += f00
+    sums[1] += f01
+    sums[2] += f11
+    sums[3] += f02
+    sums[4] += f12
+    sums[5] += f22
+    sums[6] += f03
+    sums[7] += f13
+    sums[8] += f23
+    sums[9] += f33
+
+
+@kernel()
+def observed_information(
+    kind: int, data: FloatArray, level: float, rows: FloatArray, out: FloatArray
+) -> None:
+    """Fill `out` (5, 5) with the negative Hessian of the log-likelihood in (x, y, z, a, g)."""
+    t = np.empty((3, rows.shape[2]))
+    sums = np.zeros(14)
+    out[4, 4] = 0.0
+    for row in range(rows.shape[0]):
+        here = rows[row]
+        out[4, 4] -= curvature_of_row(kind, data, row, level, here[0], t)
+        _products(t[1], here, sums)
+        for k in range(10):
+            sums[k] += _weighted(t[0], here[5 + k])
+        for i in range(4):
+            sums[10 + i] += _weighted(t[2], here[1 + i])
+    k = 0
+    for j in range(4):
+        for i in range(j + 1):
+            out[i, j] = out[j, i] = -sums[k]
+            k += 1
+        out[4, j] = out[j, 4] = -sums[10 + j]
+
+
+@kernel()
+def invert(matrix: FloatArray, like: FloatArray, active: BoolArray, out: FloatArray) -> bool:
+    """Fill `out` (5, 5) with the inverse of a positive matrix on the active parameters, else 0.
+
+    The diagonal of `like` (5, 5) is about that of the matrix.  False, and NaN, if it is not
+    positive.
+    """
+    index = marked(active)
+    n = index.size
+    lower, inverse, scale = np.zeros((n, n)), np.zeros((n, n)), np.empty(5)
+    for i in range(5):
+        scale[i] = 1.0 / np.sqrt(max(like[i, i], FLOOR))
+    out[:] = 0.0
+    if not factorise(matrix, index, scale[index], 0.0, lower):
+        out[:] = np.nan
+        return False
+    for j in range(n):
+        inverse[j, j] = 1.0 / lower[j, j]
+        for i in range(j + 1, n):
+            total = 0.0
+            for k in range(j, i):
+                total -= lower[i, k] * inverse[k, j]
+            inverse[i, j] = total / lower[i, i]
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for k in range(max(i, j), n):
+                total += inverse[k, i] * inverse[k, j]
+            out[index[i], index[j]] = total * scale[index[i]] * scale[index[j]]
+    return True
+
+
+@kernel(fastmath=FAST)
+def _row_bias(
+    kind: int,
+    data: FloatArray,
+    row: int,
+    level: float,
+    inverse: FloatArray,
+    g: FloatArray,
+    t: FloatArray,
+    sums: FloatArray,
+) -> None:
+    """Add one row's Σ ∂η [V′ tr(F⁻¹ ∂η ∂ηᵀ) + V tr(F⁻¹ ∂²η)] to `sums` (5)."""
+    c1, c2, c3 = data[1, row], data[2, row], data[3, row]
+    i00, i01, i11, i02 = inverse[0, 0], 2 * inverse[0, 1], inverse[1, 1], 2 * inverse[0, 2]
+    i12, i22, i03, i13 = 2 * inverse[1, 2], inverse[2, 2], 2 * inverse[0, 3], 2 * inverse[1, 3]
+    i23, i33 = 2 * inverse[2, 3], inverse[3, 3]
+    l0, l1, l2, l3 = 2 * inverse[0, 4], 2 * inverse[1, 4], 2 * inverse[2, 4], 2 * inverse[3, 4]
+    l4 = inverse[4, 4]
+    for j in range(c1.size):  # tr(F⁻¹ ∂s ∂sᵀ), tr(F⁻¹ ∂²s) and twice the level's row times ∂s
+        g0, g1, g2, g3 = g[1, j], g[2, j], g[3, j], g[4, j]
+        t[0, j] = g0 * (i00 * g0 + i01 * g1 + i02 * g2 + i03 * g3) + g1 * (
+            i11 * g1 + i12 * g2 + i13 * g3
+        ) + g2 * (i22 * g2 + i23 * g3) + i33 * g3 * g3  # fmt: skip
+        t[1, j] = (
+            i00 * g[5, j] + i01 * g[6, j] + i11 * g[7, j] + i02 * g[8, j] + i12 * g[9, j]
+            + i22 * g[10, j] + i03 * g[11, j] + i13 * g[12, j] + i23 * g[13, j] + i33 * g[14, j]
+        )  # fmt: skip
+        t[2, j] = l0 * g0 + l1 * g1 + l2 * g2 + l3 * g3
+    b0 = b1 = b2 = b3 = b4 = 0.0
+    for j in range(c1.size):
+        both, per, by_level = bias_of_pixel(
+            kind, c1[j], c2[j], c3[j], level, g[0, j], t[0, j], t[1, j], t[2, j], l4
+        )
+        b0 += both * per * g[1, j]
+        b1 += both * per * g[2, j]
+        b2 += both * per * g[3, j]
+        b3 += both * per * g[4, j]
+        b4 += both * by_level
+    sums[0] += b0
+    sums[1] += b1
+    sums[2] += b2
+    sums[3] += b3
+    sums[4] += b4
+
+
+@kernel()
+def first_order_bias(
+    kind: int,
+    data: FloatArray,
+    level: float,
+    rows: FloatArray,
+    free: BoolArray,
+    out: FloatArray,
+    height_known: float = 0.0,
+) -> None:
+    """Fill `out` (5) with the bias of order 1/N, NaN where the free parameters are not known."""
+    fisher, inverse, score = np.empty((5, 5)), np.empty((5, 5)), np.empty(5)
+    image_score(kind, data, level, rows, score, fisher)
+    fisher[2, 2] += height_known
+    invert(fisher, fisher, free, inverse)
+    t = np.empty((3, rows.shape[2]))
+    sums = np.zeros(5)
+    for row in range(rows.shape[0]):
+        _row_bias(kind, data, row, level, inverse, rows[row], t, sums)
+    for i in range(5):
+        out[i] = 0.0
+        for j in range(5):
+            out[i] -= 0.5 * inverse[i, j] * sums[j]
+
+
+@kernel()
+def errors_and_bias(
+    kind: int,
+    data: FloatArray,
+    level: float,
+    rows: FloatArray,
+    like: FloatArray,
+    free: BoolArray,
+    moving: BoolArray,
+    slope: float,
+    height_known: float,
+    sigma: FloatArray,
+    covariance: FloatArray,
+    bias: FloatArray,
+) -> bool:
+    """Fill errors, covariance and bias of a fit, from the likelihood and a prior of z.
+
+    Shapes: `like` (5, 5), `free, moving` (5,), `sigma` (4,), `covariance` (n, n), `bias` (5,).
+    """
+    information, inverse = np.empty((5, 5)), np.empty((5, 5))
+    observed_information(kind, data, level, rows, information)
+    information[2, 2] += height_known
+    known: bool = invert(information, like, free, inverse)
+    n = 0
+    for i in range(4):
+        sigma[i] = np.nan
+        if free[i]:
+            m = 0
+            for j in range(4):
+                if free[j]:
+                    unit = (slope if i == 3 else 1.0) * (slope if j == 3 else 1.0)
+                    covariance[n, m] = inverse[i, j] * unit
+                    m += 1
+            sigma[i] = np.sqrt(covariance[n, n])
+            n += 1
+    if known:
+        first_order_bias(kind, data, level, rows, moving, bias, height_known)
+    else:
+        bias[:] = np.nan
+    return known

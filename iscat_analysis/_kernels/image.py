@@ -14,43 +14,20 @@ with a the amplitude and e the field per unit amplitude.  Positions are nm; (x, 
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 
-from iscat_analysis._kernels import kernel
-from iscat_analysis._kernels.lattice_rows import (
-    interpolate_columns,
-    lattice_gradient,
-    lattice_signal,
-    rows_needed,
-)
-from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, LatticeLens, Lens
+from iscat_analysis._kernels import FloatArray, kernel
+from iscat_analysis._kernels.lattice import interpolate_columns, lattice_row, rows_needed
+from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, LatticeLens, Lens, Pixels
 from iscat_analysis._kernels.radial_rows import radial_gradient, radial_parts, radial_signal
 from iscat_analysis._kernels.stamp import stamp_gradient, stamp_signal
-
-FloatArray = NDArray[np.float64]
-
-
-class Pixels(NamedTuple):
-    """A grid of pixels and the samples inside each."""
-
-    x: FloatArray
-    y: FloatArray
-    offsets: FloatArray
-    weights: FloatArray
 
 
 @kernel()
 def _begin_lattice(
-    profile: FloatArray,
-    lens: LatticeLens,
-    pixels: Pixels,
-    x_p: float,
-    y_p: float,
+    profile: FloatArray, lens: LatticeLens, pixels: Pixels, x_p: float, y_p: float,
     with_gradient: bool,
-) -> FloatArray:
+) -> FloatArray:  # fmt: skip
     """Interpolate the columns of an image on a lattice."""
     f = np.empty((rows_needed(lens, pixels), pixels.x.size))
     interpolate_columns(profile, lens, pixels, x_p, y_p, with_gradient, f)
@@ -59,14 +36,9 @@ def _begin_lattice(
 
 @kernel()
 def signal_parts(
-    profile: FloatArray,
-    lens: Lens,
-    pixels: Pixels,
-    x_p: float,
-    y_p: float,
-    unit: float,
+    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, unit: float,
     out: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Fill `out` (2, ny·nx) with P and Q of the signal a P + a² Q.
 
     At the amplitude `unit` neither is lost in the rounding of the other.  Not for samples at one
@@ -78,8 +50,8 @@ def signal_parts(
     f, nx = _begin_lattice(profile, lens, pixels, x_p, y_p, False), pixels.x.size
     for row in range(pixels.y.size):
         p, q = out[0, row * nx : (row + 1) * nx], out[1, row * nx : (row + 1) * nx]
-        lattice_signal(lens, pixels, row, y_p, unit, f, p)
-        lattice_signal(lens, pixels, row, y_p, -unit, f, q)
+        lattice_row(lens, pixels, row, y_p, unit, f, p.reshape(1, nx))
+        lattice_row(lens, pixels, row, y_p, -unit, f, q.reshape(1, nx))
         for j in range(p.size):
             up, down = p[j], q[j]
             p[j], q[j] = (up - down) / (2 * unit), (up + down) / (2 * unit * unit)
@@ -87,35 +59,25 @@ def signal_parts(
 
 @kernel()
 def signal_image(
-    profile: FloatArray,
-    lens: Lens,
-    pixels: Pixels,
-    x_p: float,
-    y_p: float,
-    amplitude: float,
+    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
     out: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Fill `out` (ny, nx) with the signal on a pixel grid; the rest as in `signal_gradient`."""
     if len(lens) == STAMP:
         stamp_signal(profile, lens, pixels, x_p, y_p, amplitude, out)
     elif len(lens) == LATTICE:
         f = _begin_lattice(profile, lens, pixels, x_p, y_p, False)
         for row in range(pixels.y.size):
-            lattice_signal(lens, pixels, row, y_p, amplitude, f, out[row])
+            lattice_row(lens, pixels, row, y_p, amplitude, f, out[row : row + 1])
     else:
         radial_signal(profile, lens, pixels, x_p, y_p, amplitude, out)
 
 
 @kernel()
 def signal_gradient(
-    profile: FloatArray,
-    lens: Lens,
-    pixels: Pixels,
-    x_p: float,
-    y_p: float,
-    amplitude: float,
+    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
     out: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Signal and gradient on a pixel grid.
 
     Shapes: `out` (ny, 5, nx).
@@ -125,6 +87,6 @@ def signal_gradient(
     elif len(lens) == LATTICE:
         f = _begin_lattice(profile, lens, pixels, x_p, y_p, True)
         for row in range(pixels.y.size):
-            lattice_gradient(lens, pixels, row, y_p, amplitude, f, out[row])
+            lattice_row(lens, pixels, row, y_p, amplitude, f, out[row])
     else:
         radial_gradient(profile, lens, pixels, x_p, y_p, amplitude, out)

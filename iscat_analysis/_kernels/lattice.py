@@ -1,4 +1,4 @@
-"""The field of any pupil, tabulated on a square lattice around the particle.
+"""The field of any pupil, tabulated on a square lattice around the particle, and its images.
 
 An aberrated pupil has an azimuthal Fourier series at every polar angle, and so has its field:
 
@@ -16,6 +16,10 @@ registers; the cost does not depend on how many harmonics the pupil has.
 
 A *profile* on a lattice has shape (channels, nodes along x, nodes along y): real and imaginary part
 of each component, followed by the same for ∂/∂z, and for ∂²/∂z² where asked.
+
+The work space of a row of pixels is an array (rows, nx): `FIELDS` rows hold the fields of the
+current row and their slopes, the others the fields at the columns of pixels and the rows of nodes,
+which `interpolate_columns` computes once for each image.
 """
 
 from __future__ import annotations
@@ -24,15 +28,12 @@ import math
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import i0, j0, j1
 
-from iscat_analysis._kernels import kernel
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-
-FAST = {"contract", "reassoc", "nsz", "arcp"}
+from iscat_analysis._kernels import FAST, AnyFloatArray, ComplexArray, FloatArray, IntArray, kernel
+from iscat_analysis._kernels.lens import LatticeLens, Pixels
+from iscat_analysis._kernels.loops import mix, mix_both, within
+from iscat_analysis._kernels.radial import fill_quintics
 
 LATTICE_STEP = 1.2
 """Step of the lattice times bandwidth: 4e-8 of the peak in the field, 1e-6 in its gradient."""
@@ -109,24 +110,8 @@ def radial_waves(
             found = nodes[order, start : start + r.size].transpose(1, 0, 2)
             np.matmul(part, columns, out=found)
     powers = np.empty((intervals, 6, largest + 1, 4, fields))
-    _fill_quintics(nodes.reshape(3, intervals + 1, -1), powers.reshape(intervals, 6, -1))
+    fill_quintics(nodes.reshape(3, intervals + 1, -1), powers.reshape(intervals, 6, -1))
     return powers
-
-
-@kernel(fastmath=FAST)
-def _fill_quintics(nodes: FloatArray, powers: FloatArray) -> None:
-    """Fill `powers` (n, 6, k) from value, slope and bend (3, n + 1, k) at the nodes."""
-    for i in range(powers.shape[0]):
-        for j in range(powers.shape[2]):
-            f, d0, s0 = nodes[0, i, j], nodes[1, i, j], nodes[2, i, j]
-            d1, s1 = nodes[1, i + 1, j], nodes[2, i + 1, j]
-            rise = nodes[0, i + 1, j] - f
-            powers[i, 0, j] = f
-            powers[i, 1, j] = d0
-            powers[i, 2, j] = 0.5 * s0
-            powers[i, 3, j] = 10 * rise - 6 * d0 - 4 * d1 - 1.5 * s0 + 0.5 * s1
-            powers[i, 4, j] = -15 * rise + 8 * d0 + 7 * d1 + 1.5 * s0 - s1
-            powers[i, 5, j] = 6 * rise - 3 * d0 - 3 * d1 - 0.5 * s0 + 0.5 * s1
 
 
 def bessel_ladder(x: FloatArray, out: FloatArray) -> None:
@@ -315,3 +300,320 @@ def _filter(samples: FloatArray, undo: FloatArray, out: FloatArray) -> None:
 def reach_of_samples(reach_nm: float, step_nm: float) -> float:
     """Distance of the farthest sample that an image out to a distance needs [nm]."""
     return reach_nm + math.sqrt(2) * (TAPS / 2 + 1 + FILTER) * step_nm
+
+
+MOST = 10
+"""Real and imaginary parts of the most components of a field: see `LatticeLens`."""
+
+FIELDS = 4 * MOST
+"""Rows for a row of pixels: the fields, their ∂/∂z, slopes along x and slopes along y."""
+
+STRIP = 8
+"""Columns of pixels that are interpolated together: one cache line."""
+
+BEFORE = TAPS // 2 - 1
+"""Number of nodes before the one at the floor of a position."""
+
+BENT = 10
+"""Numbers for each part of a field: e and its derivatives x, y, z, xx, xy, yy, xz, yz, zz."""
+
+
+@kernel(fastmath=FAST)
+def taps(weights: FloatArray, t: float, per_nm: float, out: AnyFloatArray) -> None:
+    """Fill the weights of the nodes at distance t ∈ [0, 1) and their derivatives.
+
+    Shapes: `out` (1, 2 or 3 orders, TAPS).
+    """
+    for k in range(TAPS):
+        v, d, s = weights[DEGREE, k], 0.0, 0.0
+        for p in range(DEGREE):
+            s = s * t + d
+            d = d * t + v
+            v = v * t + weights[DEGREE - 1 - p, k]
+        out[0, k] = v
+        if len(out) > 1:
+            out[1, k] = d * per_nm
+        if len(out) > 2:
+            out[2, k] = 2 * s * per_nm * per_nm
+
+
+@kernel()
+def _ends(values: FloatArray) -> tuple[float, float]:
+    """Smallest and largest value; the methods of arrays take Numba 30 ms to load."""
+    low = high = values[0]
+    for value in values:
+        low, high = min(low, value), max(high, value)
+    return low, high
+
+
+@kernel(_nrt=False)
+def _node(lens: LatticeLens, away: float) -> float:
+    """Position on the lattice at a distance from the particle [nodes], inside by all its taps."""
+    last = 2 * lens.half + 1 - TAPS + BEFORE
+    place: float = within(away * lens.inv_step + lens.half, float(BEFORE), float(last))
+    return place
+
+
+@kernel()
+def node_rows(lens: LatticeLens, pixels: Pixels, y_p: float) -> tuple[int, int]:
+    """First row of nodes that an image needs, and how many."""
+    margin = abs(pixels.offsets[-1])
+    low, high = _ends(pixels.y)
+    first = int(_node(lens, low - margin - y_p)) - BEFORE
+    last = int(_node(lens, high + margin - y_p)) - BEFORE
+    return first, last + TAPS - first
+
+
+@kernel()
+def rows_needed(lens: LatticeLens, pixels: Pixels) -> int:
+    """Rows of work space that an image needs, wherever the particle is."""
+    low, high = _ends(pixels.y)
+    span = high - low + 2 * abs(pixels.offsets[-1])
+    rows = int(span * lens.inv_step) + TAPS + 2
+    return FIELDS + pixels.offsets.size * 6 * lens.components * rows
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def _blend(nodes: FloatArray, row: int, first: int, w: FloatArray, out: FloatArray) -> None:
+    """Fill `out` (n) with the combination w of TAPS rows of `nodes`, n columns from the first."""
+    last = first + out.size
+    for k in range(0, TAPS, 4):
+        a, b = nodes[row + k, first:last], nodes[row + k + 1, first:last]
+        c, d = nodes[row + k + 2, first:last], nodes[row + k + 3, first:last]
+        mix(a, b, c, d, w, k, out)
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def _blend_both(
+    nodes: FloatArray,
+    row: int,
+    first: int,
+    w: FloatArray,
+    v: FloatArray,
+    out: FloatArray,
+    other: FloatArray,
+) -> None:
+    """Fill `out` and `other` with two combinations of the same rows; see `_blend`."""
+    last = first + out.size
+    for k in range(0, TAPS, 4):
+        a, b = nodes[row + k, first:last], nodes[row + k + 1, first:last]
+        c, d = nodes[row + k + 2, first:last], nodes[row + k + 3, first:last]
+        mix_both(a, b, c, d, w, v, k, out, other)
+
+
+@kernel()
+def _locate(lens: LatticeLens, away: float, w: FloatArray) -> int:
+    """Fill the weights of the nodes at a distance from the particle; give the first of them."""
+    place = _node(lens, away)
+    taps(lens.window, place - int(place), lens.inv_step, w)
+    return int(place) - BEFORE
+
+
+@kernel(fastmath=FAST)
+def _columns(
+    plane: FloatArray, left: IntArray, weights: FloatArray, first: int, strip: FloatArray,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """Interpolate one channel along x, `STRIP` columns of pixels at a time.
+
+    The strip is transposed into rows of `out` (rows, nx) at once, so that each cache line is
+    written once.
+    """
+    rows, columns = out.shape
+    for start in range(0, columns, STRIP):
+        count = min(STRIP, columns - start)
+        for j in range(count):
+            _blend(plane, left[start + j], first, weights[start + j], strip[j])
+        for r in range(rows):
+            for j in range(count):
+                out[r, start + j] = strip[j, r]
+
+
+@kernel()
+def interpolate_columns(
+    profile: FloatArray, lens: LatticeLens, pixels: Pixels, x_p: float, y_p: float,
+    with_gradient: bool, f: FloatArray,
+) -> None:  # fmt: skip
+    """Interpolate along x: fields and slopes at every column of pixels and row of nodes."""
+    first, rows = node_rows(lens, pixels, y_p)
+    columns = pixels.x.size
+    w, left = np.empty((2, columns, TAPS)), np.empty(columns, dtype=np.int64)
+    strip = np.empty((STRIP, rows))
+    width = 2 * lens.components
+    here = FIELDS
+    for sample in range(pixels.offsets.size):
+        for j in range(columns):
+            left[j] = _locate(lens, pixels.x[j] + pixels.offsets[sample] - x_p, w[:, j])
+        for k in range(2 * width if with_gradient else width):
+            _columns(profile[k], left, w[0], first, strip, f[here : here + rows])
+            here += rows
+        if with_gradient:
+            for k in range(width):
+                _columns(profile[k], left, w[1], first, strip, f[here : here + rows])
+                here += rows
+
+
+@kernel(fastmath=FAST)
+def _add_gradient(
+    rho: float, amplitude: float, weight: float, f: FloatArray, part: int, out: FloatArray
+) -> None:
+    """Add one component's share of signal and gradient to `out` (5, nx)."""
+    a = amplitude
+    e_r, e_i = f[part], f[part + 1]
+    z_r, z_i = f[MOST + part], f[MOST + 1 + part]
+    x_r, x_i = f[2 * MOST + part], f[2 * MOST + 1 + part]
+    y_r, y_i = f[3 * MOST + part], f[3 * MOST + 1 + part]
+    for j in range(e_r.size):
+        g_r, g_i = 2 * weight * a * (rho + a * e_r[j]), 2 * weight * a * a * e_i[j]
+        out[1, j] -= g_r * x_r[j] + g_i * x_i[j]
+        out[2, j] -= g_r * y_r[j] + g_i * y_i[j]
+    for j in range(e_r.size):
+        g_r, g_i = 2 * weight * a * (rho + a * e_r[j]), 2 * weight * a * a * e_i[j]
+        power = e_r[j] * e_r[j] + e_i[j] * e_i[j]
+        out[3, j] += g_r * z_r[j] + g_i * z_i[j]
+        out[0, j] += weight * a * (2 * rho * e_r[j] + a * power)
+        out[4, j] += weight * (2 * rho * e_r[j] + 2 * a * power)
+
+
+@kernel(fastmath=FAST)
+def _add_signal(
+    rho: float, a: float, weight: float, e_r: FloatArray, e_i: FloatArray, out: FloatArray
+) -> None:
+    """Add one component's share of the signal to `out` (nx)."""
+    for j in range(out.size):
+        out[j] += weight * a * (2 * rho * e_r[j] + a * (e_r[j] * e_r[j] + e_i[j] * e_i[j]))
+
+
+@kernel(forceinline=True)
+def lattice_row(
+    lens: LatticeLens, pixels: Pixels, row: int, y_p: float, amplitude: float, f: FloatArray,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """Fill `out` with signal and gradient (5, nx) of one row, or its signal alone (1, nx)."""
+    first, rows = node_rows(lens, pixels, y_p)
+    gradient, w = len(out) > 1, np.empty((2, TAPS))
+    width, q = 2 * lens.components, pixels.offsets.size
+    out[:] = 0.0
+    for i in range(q):
+        top = _locate(lens, pixels.y[row] + pixels.offsets[i] - y_p, w) - first
+        for sample in range(q):
+            start = FIELDS + sample * (3 if gradient else 1) * width * rows + top
+            for k in range(width):
+                here = start + k * rows
+                if not gradient:
+                    _blend(f, here, 0, w[0], f[k])
+                    continue
+                _blend_both(f, here, 0, w[0], w[1], f[k], f[3 * MOST + k])
+                here += width * rows
+                _blend(f, here, 0, w[0], f[MOST + k])
+                here += width * rows
+                _blend(f, here, 0, w[0], f[2 * MOST + k])
+            weight = pixels.weights[i] * pixels.weights[sample]
+            for c in range(lens.components):
+                rho = lens.rho if c == 0 else 0.0
+                if gradient:
+                    _add_gradient(rho, amplitude, weight, f, 2 * c, out)
+                else:
+                    _add_signal(rho, amplitude, weight, f[2 * c], f[2 * c + 1], out[0])
+
+
+@kernel(fastmath=FAST)
+def _add_product(
+    rho: float, weight: float, f: FloatArray, field: int, change: int, out: FloatArray
+) -> None:
+    """Add weight × Re (ρ + e)* d to `out`; e and d are pairs of rows of f."""
+    e_r, e_i, d_r, d_i = f[field], f[field + 1], f[change], f[change + 1]
+    for j in range(out.size):
+        out[j] += weight * ((rho + e_r[j]) * d_r[j] + e_i[j] * d_i[j])
+
+
+@kernel()
+def lattice_values(
+    stack: FloatArray,
+    lens: LatticeLens,
+    pixels: Pixels,
+    x_p: float,
+    y_p: float,
+    amplitude: float,
+    components: int,
+    out: FloatArray,
+) -> None:
+    """Signal of a field and its derivatives along changes of that field.
+
+    Shapes: `stack` (k·components·2, nodes, nodes), `out` (k, ny, nx).
+    """
+    first, rows = node_rows(lens, pixels, y_p)
+    columns, channels, a = pixels.x.size, stack.shape[0], amplitude
+    w, left = np.empty((1, columns, TAPS)), np.empty(columns, dtype=np.int64)
+    strip, f = np.empty((STRIP, rows)), np.empty((channels, columns))
+    across = np.empty((channels, rows, columns))
+    out[:] = 0.0
+    for sample in range(pixels.offsets.size):
+        for j in range(columns):
+            left[j] = _locate(lens, pixels.x[j] + pixels.offsets[sample] - x_p, w[:, j])
+        for k in range(channels):
+            _columns(stack[k], left, w[0], first, strip, across[k])
+        for row in range(pixels.y.size):
+            for i in range(pixels.offsets.size):
+                away = pixels.y[row] + pixels.offsets[i] - y_p
+                top = _locate(lens, away, w[:, 0]) - first
+                for k in range(channels):
+                    _blend(across[k], top, 0, w[0, 0], f[k])
+                weight = pixels.weights[i] * pixels.weights[sample]
+                for c in range(components):
+                    rho = lens.rho if c == 0 else 0.0
+                    _add_signal(rho, a, weight, f[2 * c], f[2 * c + 1], out[0, row])
+                    for j in range(f.shape[1]):
+                        f[2 * c, j] *= a
+                        f[2 * c + 1, j] *= a
+                    for k in range(1, out.shape[0]):
+                        change = 2 * (k * components + c)
+                        _add_product(rho, 2 * a * weight, f, 2 * c, change, out[k, row])
+
+
+@kernel()
+def lattice_span(lens: LatticeLens, x: FloatArray, margin: float, x_p: float) -> tuple[int, int]:
+    """Range of the flattened lattice that an image needs."""
+    side = 2 * lens.half + 1
+    low, high = _ends(x)
+    first = int(_node(lens, low - margin - x_p)) - BEFORE
+    last = int(_node(lens, high + margin - x_p)) - BEFORE + TAPS
+    return first * side, last * side
+
+
+@kernel()
+def lattice_waves(
+    profile: FloatArray, lens: LatticeLens, component: int, dx: FloatArray, dy: FloatArray,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """Fill `out` (2 BENT or more, n) with a component of the field at n points, see `BENT`."""
+    wx, wy, width = np.empty((3, TAPS)), np.empty((3, TAPS)), 2 * lens.components
+    for point in range(dx.size):
+        px, py = _node(lens, dx[point]), _node(lens, dy[point])
+        taps(lens.window, px - int(px), lens.inv_step, wx)
+        taps(lens.window, py - int(py), lens.inv_step, wy)
+        left, top = int(px) - BEFORE, int(py) - BEFORE
+        for part in range(2):
+            e, here = out[BENT * part : BENT * (part + 1), point], 2 * component + part
+            e[:] = 0.0
+            for k in range(TAPS):
+                value, along_z = profile[here, left + k], profile[width + here, left + k]
+                bent = profile[2 * width + here, left + k]
+                v = v_y = v_yy = z = z_y = zz = 0.0
+                for m in range(TAPS):
+                    v += wy[0, m] * value[top + m]
+                    v_y += wy[1, m] * value[top + m]
+                    v_yy += wy[2, m] * value[top + m]
+                    z += wy[0, m] * along_z[top + m]
+                    z_y += wy[1, m] * along_z[top + m]
+                    zz += wy[0, m] * bent[top + m]
+                e[0] += wx[0, k] * v
+                e[1] += wx[1, k] * v
+                e[2] += wx[0, k] * v_y
+                e[3] += wx[0, k] * z
+                e[4] += wx[2, k] * v
+                e[5] += wx[1, k] * v_y
+                e[6] += wx[0, k] * v_yy
+                e[7] += wx[1, k] * z
+                e[8] += wx[0, k] * z_y
+                e[9] += wx[0, k] * zz

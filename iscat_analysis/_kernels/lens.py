@@ -9,12 +9,7 @@ from __future__ import annotations
 
 from typing import Any, Final, NamedTuple, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
-from iscat_analysis._kernels import kernel
-
-FloatArray = NDArray[np.float64]
+from iscat_analysis._kernels import FloatArray, kernel
 
 
 class RoundLens(NamedTuple):
@@ -49,6 +44,15 @@ class StampLens(NamedTuple):
     half: int
     window: FloatArray
     fine: int
+
+
+class Pixels(NamedTuple):
+    """A grid of pixels and the samples inside each."""
+
+    x: FloatArray
+    y: FloatArray
+    offsets: FloatArray
+    weights: FloatArray
 
 
 Lens: TypeAlias = RoundLens | LatticeLens | StampLens

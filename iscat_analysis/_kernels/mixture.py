@@ -9,12 +9,8 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from iscat_analysis._kernels import kernel
-from iscat_analysis._kernels.lattice import FAST
-
-FloatArray = NDArray[np.float64]
+from iscat_analysis._kernels import FAST, FloatArray, kernel
 
 _LOG_2PI = math.log(2.0 * math.pi)
 _CERTAIN_SIGMAS = 9.0  # standard deviations above the threshold: the probability is 1

@@ -6,16 +6,28 @@ particle in one frame, θ = (x, y, z, a, 0); rows are in the order of their fram
 frame t are starts[t] to starts[t + 1].  Within a frame they are fitted one after the other, each
 with the others in its background, so that the result does not depend on the distribution of frames
 over threads.
+
+`place_score` gives score, information and likelihood of a particle in one pass over its square, as
+`image_score` and `image_value` of `iscat_analysis._kernels.scoring` do for a POISSON image at level
+1, without the parameters that a fit of a frame does not need: the level and, for an image at one
+height, z.  All three share the expected counts and one division per pixel.  For n counts, of which
+b are expected without the particle and δ more with it, and w = δ/(2b + δ), the log-likelihood
+n ln(1 + δ/b) − δ is computed as
+
+    (n − b) 2 artanh w + w² (2 b w (1/3 + w²/5 + …) − 2 b − δ),
+
+with artanh from its series.  No term is much larger than the result, so that single precision is
+enough, which is twice as fast.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels import kernel
+from iscat_analysis._kernels import FAST, AnyFloatArray, BoolArray, FloatArray, IntArray, kernel
 from iscat_analysis._kernels.background_response import Slopes, keep_slopes
 from iscat_analysis._kernels.canvas import (
     Canvas,
@@ -23,21 +35,106 @@ from iscat_analysis._kernels.canvas import (
     Field,
     Light,
     Pictures,
+    Rows,
     cut,
     draw_gradient,
     square_of,
     stage,
 )
-from iscat_analysis._kernels.image import Pixels
-from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.lines import copy_line
-from iscat_analysis._kernels.place_score import place_score
-from iscat_analysis._kernels.scoring import CONVERGED, STALLED, scoring_step
+from iscat_analysis._kernels.lens import STAMP, Lens, Pixels
+from iscat_analysis._kernels.loops import copy_line
+from iscat_analysis._kernels.noise import FLOOR, POISSON, SERIES, twice_artanh
+from iscat_analysis._kernels.scoring import (
+    CONVERGED,
+    STALLED,
+    image_score,
+    image_value,
+    scoring_step,
+)
 
-FloatArray = NDArray[np.float64]
-AnyFloatArray = NDArray[np.floating[Any]]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+LEAST = 1e-15
+"""Smallest expected count, like `FLOOR` of `noise`; its square is above 0 in single precision."""
+
+
+@kernel(_nrt=False)
+def place_score(
+    data: AnyFloatArray, here: AnyFloatArray, lens: Lens, score: FloatArray, fisher: FloatArray
+) -> float:
+    """Fill score and Fisher matrix of (x, y, z, a), and give the log-likelihood.
+
+    Shapes: `data` (4, ny, nx), `here` (ny, 5, nx), `score, fisher` (5,).
+    """
+    if len(lens) != STAMP:
+        image_score(np.int64(POISSON), data, 1.0, here, score, fisher)
+        score[4] = 0.0
+        for i in range(5):
+            fisher[i, 4] = fisher[4, i] = 0.0
+        value: float = image_value(np.int64(POISSON), data, 1.0, here)
+        return value
+    value, beyond = _flat_score(data, here, score, fisher)
+    if beyond:
+        value = _bright_value(data, here)
+    return value
+
+
+@kernel(_nrt=False)
+def _bright_value(data: AnyFloatArray, here: AnyFloatArray) -> float:
+    """Log-likelihood in double precision, by the logarithm itself where its series fails."""
+    total = 0.0
+    for i in range(data.shape[1]):
+        c0, c1, c2, c3, s = data[0, i], data[1, i], data[2, i], data[3, i], here[i, 0]
+        for j in range(s.size):
+            base, change = max(float(c1[j]) + c3[j], FLOOR), float(c2[j]) * s[j]
+            if abs(change) < SERIES * base:
+                total += c0[j] * twice_artanh(change / (2.0 * base + change)) - change
+            else:
+                total += c0[j] * np.log(max(base + change, FLOOR) / base) - change
+    return total
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def _flat_score(
+    data: AnyFloatArray, here: AnyFloatArray, score: FloatArray, fisher: FloatArray
+) -> tuple[float, float]:
+    """Do it without z; also count the pixels in which the series of the logarithm fails."""
+    zero, one, two = data.dtype.type(0.0), data.dtype.type(1.0), data.dtype.type(2.0)
+    least, series = data.dtype.type(LEAST), data.dtype.type(SERIES)
+    t3, t5, t7 = one / data.dtype.type(3.0), one / data.dtype.type(5.0), one / data.dtype.type(7.0)
+    t9, t11 = one / data.dtype.type(9.0), one / data.dtype.type(11.0)
+    b0 = b1 = b3 = f00 = f01 = f03 = f11 = f13 = f33 = value = beyond = zero
+    for i in range(data.shape[1]):
+        c0, c1, c2, c3 = data[0, i], data[1, i], data[2, i], data[3, i]
+        s, gx, gy, ga = here[i, 0], here[i, 1], here[i, 2], here[i, 4]
+        for j in range(s.size):
+            base, change = max(c1[j] + c3[j], least), c2[j] * s[j]
+            rate, middle = max(base + change, least), two * base + change
+            per = one / (rate * middle)  # one division for both quotients, since it is slow
+            beyond += one if abs(change) >= series * base else zero
+            w = change * (rate * per)
+            w2 = w * w
+            tail = w * (t3 + w2 * (t5 + w2 * (t7 + w2 * (t9 + w2 * t11))))
+            value += two * (c0[j] - base) * (w + w2 * tail) + w2 * (two * base * tail - middle)
+            bend = c2[j] * (middle * per)
+            pull = (c0[j] - rate) * bend
+            bend *= c2[j]
+            b0 += pull * gx[j]
+            b1 += pull * gy[j]
+            b3 += pull * ga[j]
+            hx, hy, ha = bend * gx[j], bend * gy[j], bend * ga[j]
+            f00 += hx * gx[j]
+            f01 += hx * gy[j]
+            f03 += hx * ga[j]
+            f11 += hy * gy[j]
+            f13 += hy * ga[j]
+            f33 += ha * ga[j]
+    score[:] = 0.0
+    fisher[:] = 0.0
+    score[0], score[1], score[3] = b0, b1, b3
+    fisher[0, 0], fisher[1, 1], fisher[3, 3] = f00, f11, f33
+    fisher[0, 1] = fisher[1, 0] = f01
+    fisher[0, 3] = fisher[3, 0] = f03
+    fisher[1, 3] = fisher[3, 1] = f13
+    return float(value), float(beyond)
 
 
 DIVERGED = 4
@@ -56,6 +153,14 @@ class Search(NamedTuple):
     passes: int
 
 
+class Fits(NamedTuple):
+    """How the fits of rows ended (n,), their information (n, 4, 4) and gain in likelihood (n,)."""
+
+    outcome: IntArray
+    information: FloatArray
+    gain: FloatArray
+
+
 class Room(NamedTuple):
     """Work space of the kernels of rows, which allocate no memory."""
 
@@ -70,35 +175,19 @@ class Room(NamedTuple):
 
 @kernel(_nrt=False)
 def fit_frames(
-    light: Light,
-    field: Field,
-    near: Pictures,
-    search: Search,
-    starts: IntArray,
-    last: int,
-    sweeps: int,
-    theta: FloatArray,
-    group: IntArray,
-    canvas: Canvas,
-    slopes: Slopes,
-    outcome: IntArray,
-    information: FloatArray,
-    gain: FloatArray,
-    expected: FloatArray,
-    background: NDArray[np.float32],
-    sums: NDArray[np.float32],
-    place: IntArray,
-    room: Room,
-) -> bool:
+    light: Light, field: Field, near: Pictures, search: Search, particles: Rows, last: int,
+    sweeps: int, canvas: Canvas, slopes: Slopes, fits: Fits, expected: FloatArray,
+    background: NDArray[np.float32], sums: NDArray[np.float32], place: IntArray, room: Room,
+) -> bool:  # fmt: skip
     """Fit the rows of frames up to last − 1, each `sweeps` times, with plain scoring steps.
 
     If plain steps fail for a row, the kernel returns its position, its constants and a start inside
-    its box.  The caller puts its maximum into `theta`, `outcome` and `gain`, and calls again.
+    its box.  The caller puts its maximum into `particles` and `fits`, and calls again.
 
-    Shapes: `starts` (t + 1,), `theta` (rows, 5), `group` (rows,), `outcome` (rows,), `information`
-    (rows, 4, 4), `gain` (rows,), `expected` (t,), `background` (y, x), `sums` (y, x), `place`
-    (7,).
+    Shapes: `expected` (t,), `background` (y, x), `sums` (y, x), `place` (7,).
     """
+    starts, theta, group = particles
+    outcome, information, gain = fits
     rows, columns = light.background.shape
     area = field.side**2
     fisher, step, score, start = room.small[:5], room.small[5], room.small[6], room.small[10]
@@ -260,3 +349,72 @@ def _add_signals(
             out[j] += w * signal[j]
             amount += light[j] * signal[j]
     return float(amount)
+
+
+_ROUNDING = 1e-9  # share of the reach by which rounding may change a distance
+
+
+@kernel()
+def link_surely(
+    places: FloatArray, starts: IntArray, first: int, reach: float, memory: int, track: IntArray,
+    taken: BoolArray, waiting: IntArray, state: IntArray, doubtful: IntArray,
+) -> int:  # fmt: skip
+    """Link positions from frame to frame until there is a choice.
+
+    A particle waits at its last position until it is linked, at most `memory` frames beyond the
+    next one.  If it has one new position within reach, and this position no other particle, the two
+    are linked.  A position without a particle within reach begins a track.
+
+    Shapes: `places` (n, axes), `starts` (t + 1,), `track` (n,), `taken` (n,), `waiting` (n,),
+    `state` (4,), `doubtful` (n,).
+    """
+    onward, backward = np.empty(len(places), dtype=np.int64), np.empty(len(places), dtype=np.int64)
+    only = np.empty(len(places), dtype=np.int64)
+    for t in range(first, starts.size - 1):
+        begin, end = starts[t], starts[t + 1]
+        oldest, count = starts[max(t - 1 - memory, 0)], 0
+        for k in range(state[0]):
+            i = waiting[k]
+            if i >= oldest and not taken[i]:
+                waiting[count] = i
+                count += 1
+        onward[:count], backward[begin:end] = 0, 0
+        for k in range(count):
+            for j in range(begin, end):
+                if _within(places, waiting[k], j, reach * (1 + _ROUNDING)):
+                    onward[k] += 1
+                    backward[j] += 1
+                    only[j] = k
+        for j in range(begin, end):
+            if backward[j] == 0:
+                track[j] = state[1]
+                state[1] += 1
+            elif backward[j] == 1 and onward[only[j]] == 1:
+                i = waiting[only[j]]
+                if _within(places, i, j, reach * (1 - _ROUNDING)):
+                    track[j], taken[i] = track[i], True
+                    backward[j] = 0
+        left = 0
+        for k in range(count):
+            if onward[k] > 0 and not taken[waiting[k]]:
+                doubtful[left] = waiting[k]
+                left += 1
+        state[2] = left
+        for j in range(begin, end):
+            waiting[count] = j
+            count += 1
+            if backward[j] > 0:
+                doubtful[left] = j
+                left += 1
+        state[0], state[3] = count, left - state[2]
+        if left > 0:
+            return t
+    return starts.size - 1
+
+
+@kernel()
+def _within(places: FloatArray, i: int, j: int, reach: float) -> bool:
+    square = 0.0
+    for k in range(places.shape[1]):
+        square += (places[i, k] - places[j, k]) ** 2
+    return square <= reach**2

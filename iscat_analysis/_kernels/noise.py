@@ -20,12 +20,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from iscat_analysis._kernels import kernel
-from iscat_analysis._kernels.lattice import FAST
-
-FloatArray = NDArray[np.float64]
+from iscat_analysis._kernels import FAST, FloatArray, kernel
 
 CONDITIONAL, POISSON = 0, 1
 

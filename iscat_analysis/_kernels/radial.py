@@ -28,11 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import j0, j1
 
-from iscat_analysis._kernels import kernel
+from iscat_analysis._kernels import FloatArray, kernel
+from iscat_analysis._kernels.loops import whole
 from iscat_analysis._kernels.vectors import LANES, Code, instructions
-from iscat_analysis._kernels.whole import whole
-
-FloatArray = NDArray[np.float64]
 
 STEP = 0.3
 """Step times bandwidth, along r and z: 1.6e-8 of the peak in the field, 3e-7 in its gradient."""
@@ -105,6 +103,22 @@ def bessel_table(transverse: FloatArray, step_nm: float, intervals: int) -> Floa
 
 
 @kernel(fastmath={"contract", "reassoc", "nsz"})
+def fill_quintics(nodes: FloatArray, powers: FloatArray) -> None:
+    """Fill `powers` (n, 6, k) from value, slope and bend (3, n + 1, k) at the nodes."""
+    for i in range(powers.shape[0]):
+        for j in range(powers.shape[2]):
+            f, d0, s0 = nodes[0, i, j], nodes[1, i, j], nodes[2, i, j]
+            d1, s1 = nodes[1, i + 1, j], nodes[2, i + 1, j]
+            rise = nodes[0, i + 1, j] - f
+            powers[i, 0, j] = f
+            powers[i, 1, j] = d0
+            powers[i, 2, j] = 0.5 * s0
+            powers[i, 3, j] = 10 * rise - 6 * d0 - 4 * d1 - 1.5 * s0 + 0.5 * s1
+            powers[i, 4, j] = -15 * rise + 8 * d0 + 7 * d1 + 1.5 * s0 - s1
+            powers[i, 5, j] = 6 * rise - 3 * d0 - 3 * d1 - 0.5 * s0 + 0.5 * s1
+
+
+@kernel(fastmath={"contract", "reassoc", "nsz"})
 def _add_four(
     w: FloatArray,
     a: FloatArray,
@@ -157,22 +171,7 @@ def radial_profile(
                     weight[which, order, :, i : i + 4], rows[which, i], rows[which, i + 1],
                     rows[which, i + 2], rows[which, i + 3], nodes[channel], nodes[channel + 1],
                 )  # fmt: skip
-    for channel in range(4 * orders):
-        f = nodes[channel, :points]
-        d = nodes[channel, points : 2 * points]
-        s = nodes[channel, 2 * points :]
-        for k in range(points - 1):
-            rise = f[k + 1] - f[k]
-            profile[k, 0, channel] = f[k]
-            profile[k, 1, channel] = d[k]
-            profile[k, 2, channel] = 0.5 * s[k]
-            profile[k, 3, channel] = (
-                10 * rise - 6 * d[k] - 4 * d[k + 1] - 1.5 * s[k] + 0.5 * s[k + 1]
-            )
-            profile[k, 4, channel] = -15 * rise + 8 * d[k] + 7 * d[k + 1] + 1.5 * s[k] - s[k + 1]
-            profile[k, 5, channel] = (
-                6 * rise - 3 * d[k] - 3 * d[k + 1] - 0.5 * s[k] + 0.5 * s[k + 1]
-            )
+    fill_quintics(nodes.reshape(4 * orders, 3, points).transpose(1, 2, 0), profile)
 
 
 def _mixed(code: Code, place: Any, orders: int) -> list[tuple[Any, Any]]:

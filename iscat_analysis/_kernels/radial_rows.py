@@ -1,27 +1,148 @@
 """From a radial profile to the image of a particle and its gradient, a strip of rows at a time.
 
-A strip needs two loops over all of its pixels: the first evaluates the quintics, eight pixels
-at a time (`iscat_analysis._kernels.quintics`); the second combines them.  Both use vector
-registers, and their rows of scratch fit into the first cache.
+A strip needs two loops over all of its pixels: the first evaluates the quintics, eight pixels at a
+time; the second combines them.  Both use vector registers, and their rows of scratch fit into the
+first cache.
+
+Every pixel lies in another interval of the profile, so that a loop over pixels would read its six
+powers one by one, and the compiler would use no vector registers.  So all channels of one pixel,
+which are next to each other in a profile, are evaluated in one register.  The registers of eight
+pixels are then transposed.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
 
-from iscat_analysis._kernels import kernel
-from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.quintics import DISTANCE, evaluate, evaluate_slopes, padded
-from iscat_analysis._kernels.whole import whole
+from iscat_analysis._kernels import FAST, FloatArray, kernel
+from iscat_analysis._kernels.lens import Pixels, RoundLens
+from iscat_analysis._kernels.loops import whole
+from iscat_analysis._kernels.radial import POWERS
+from iscat_analysis._kernels.vectors import LANES, Code, instructions
 
-if TYPE_CHECKING:
-    from iscat_analysis._kernels.image import Pixels
-    from iscat_analysis._kernels.lens import RoundLens
+DISTANCE = 12
+"""Row of the distances, after eight channels and four slopes."""
 
-FloatArray = NDArray[np.float64]
+
+@kernel()
+def padded(pixels: int) -> int:
+    """Give the length of a row of scratch."""
+    return (pixels + LANES - 1) // LANES * LANES
+
+
+@kernel()
+def evaluate(profile: FloatArray, f: FloatArray) -> None:
+    """Evaluate the first four channels of a profile.
+
+    Shapes: `profile` (intervals, 6, 4 or more), `f` (rows, padded).
+    """
+    for j in range(0, f.shape[1], LANES):
+        _values(profile, f, j)
+
+
+@kernel()
+def evaluate_slopes(profile: FloatArray, f: FloatArray) -> None:
+    """Evaluate eight channels like `evaluate`, and in rows 8 to 11 slopes of the first four."""
+    for j in range(0, f.shape[1], LANES):
+        _with_slopes(profile, f, j)
+
+
+@kernel()
+def evaluate_last_slopes(profile: FloatArray, f: FloatArray) -> None:
+    """Evaluate the last eight of twelve channels like `evaluate_slopes`."""
+    for j in range(0, f.shape[1], LANES):
+        _with_last_slopes(profile, f, j)
+
+
+@kernel()
+def evaluate_bends(profile: FloatArray, f: FloatArray) -> None:
+    """Evaluate as `evaluate`, and in rows 4 to 7 slopes, in rows 8 to 11 second derivatives."""
+    for j in range(0, f.shape[1], LANES):
+        _with_bends(profile, f, j)
+
+
+def _places(code: Code) -> tuple[list[Any], Any]:
+    """Give where the powers of eight pixels begin, and their positions in their intervals."""
+    intervals, t = code.parted(code.in_row(code.other, DISTANCE, code.first))
+    size = code.times(code.index(POWERS), code.length(code.one, 2))
+    return [code.times(interval, size) for interval in intervals], t
+
+
+def _powers(code: Code, begin: Any, channels: int) -> list[Any]:
+    """Load the powers of some channels."""
+    every = code.length(code.one, 2)
+    places = (code.plus(begin, code.times(code.index(k), every)) for k in range(POWERS))
+    return [code.load(code.at(code.one, place), channels) for place in places]
+
+
+def _pairs(code: Code) -> Iterator[tuple[list[Any], Any]]:
+    """Load powers of four channels, of a pixel and of the fourth after it in one register."""
+    begin, t = _places(code)
+    half = LANES // 2
+    for k in range(half):
+        near, far = _powers(code, begin[k], half), _powers(code, begin[k + half], half)
+        both = zip(near, far, strict=True)
+        yield [code.joined(*pair) for pair in both], code.chosen(t, [k] * half + [k + half] * half)
+
+
+def _store(code: Code, rows: list[Any]) -> None:
+    """Fill the first rows of scratch."""
+    for k, row in enumerate(rows):
+        code.store(row, code.in_row(code.other, k, code.first))
+
+
+def _write_with_slopes(code: Code, skipped: int = 0) -> None:
+    """Horner's rule for eight channels and their slopes, of which four are kept."""
+    values, slopes = [], []
+    begin, places = _places(code)
+    for k in range(LANES):
+        c = _powers(code, code.plus(begin[k], code.index(skipped)), LANES)
+        t = code.chosen(places, [k] * LANES)
+        value, slope = code.multiply_add(c[5], t, c[4]), c[5]
+        for power in (3, 2, 1, 0):
+            slope = code.multiply_add(slope, t, value)
+            value = code.multiply_add(value, t, c[power])
+        values.append(value)
+        slopes.append(slope)
+    _store(code, code.exchanged(values) + code.exchanged(slopes)[: LANES // 2])
+
+
+def _write_values(code: Code) -> None:
+    """Horner's rule for four channels."""
+    values = []
+    for c, t in _pairs(code):
+        value = c[5]
+        for k in (4, 3, 2, 1, 0):
+            value = code.multiply_add(value, t, c[k])
+        values.append(value)
+    _store(code, code.exchanged(values))
+
+
+def _write_with_bends(code: Code) -> None:
+    """Horner's rule for four channels, their slopes and second derivatives."""
+    values, slopes, bends = [], [], []
+    for c, t in _pairs(code):
+        value, slope, bend = code.multiply_add(c[5], t, c[4]), c[5], c[5]
+        slope, value = code.multiply_add(slope, t, value), code.multiply_add(value, t, c[3])
+        for k in (2, 1, 0):
+            bend = code.multiply_add(bend, t, slope)
+            slope = code.multiply_add(slope, t, value)
+            value = code.multiply_add(value, t, c[k])
+        values.append(value)
+        slopes.append(slope)
+        bends.append(code.plus_itself(bend))
+    _store(code, [row for rows in (values, slopes, bends) for row in code.exchanged(rows)])
+
+
+_with_slopes = instructions(_write_with_slopes)
+_with_last_slopes = instructions(lambda code: _write_with_slopes(code, LANES // 2))
+_values = instructions(_write_values)
+_with_bends = instructions(_write_with_bends)
+
 
 _DX, _DY, _SUMS = DISTANCE + 1, DISTANCE + 2, DISTANCE + 3
 """Rows of scratch after those of the quintics: dx, dy, and the sums over the samples."""
@@ -57,11 +178,9 @@ def _place(
 
 
 @kernel(fastmath=FAST)
-def _add_gradient(
-    inv_step: float, rho: float, cos_psi: float, sin_psi: float, co: float, cross: float,
-    ring: float, amplitude: float, weight: float, f: FloatArray,
-) -> None:  # fmt: skip
+def _add_gradient(lens: RoundLens, amplitude: float, weight: float, f: FloatArray) -> None:
     """Add weight × (s, ∂s/∂x_p, ∂s/∂y_p, ∂s/∂z, ∂s/∂a) of a strip to its sums."""
+    inv_step, rho, cos_psi, sin_psi, co, cross, ring = lens
     a = amplitude
     for j in range(f.shape[1]):
         dx, dy = f[_DX, j], f[_DY, j]
@@ -97,11 +216,9 @@ def _add_gradient(
 
 
 @kernel(fastmath=FAST)
-def _add_parts(
-    rho: float, cos_psi: float, sin_psi: float, co: float, cross: float, ring: float,
-    weight: float, f: FloatArray,
-) -> None:  # fmt: skip
+def _add_parts(lens: RoundLens, weight: float, f: FloatArray) -> None:
     """Add weight × the factors of a and a² in a strip of signals to its sums."""
+    _, rho, cos_psi, sin_psi, co, cross, ring = lens
     for j in range(f.shape[1]):
         dx, dy = f[_DX, j], f[_DY, j]
         u, v = cos_psi * dx + sin_psi * dy, cos_psi * dy - sin_psi * dx
@@ -140,15 +257,10 @@ def radial_strip(
             weight = weights[i] * weights[j]
             if count == 5:
                 evaluate_slopes(profile, f)
-                _add_gradient(
-                    lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross,
-                    lens.ring, amplitude, weight, f,
-                )  # fmt: skip
+                _add_gradient(lens, amplitude, weight, f)
             else:
                 evaluate(profile, f)
-                _add_parts(
-                    lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross, lens.ring, weight, f
-                )
+                _add_parts(lens, weight, f)
     return sums
 
 
@@ -193,13 +305,83 @@ def radial_signal(
     out: FloatArray,
 ) -> None:  # fmt: skip
     """As `iscat_analysis._kernels.image.signal_image`."""
-    rows, columns = pixels.y.size, pixels.x.size
-    together, f = strip_scratch(pixels)
-    for first in range(0, rows, together):
-        last = min(first + together, rows)
-        sums = radial_strip(profile, lens, pixels, first, last, x_p, y_p, 1.0, 2, f)
-        for row in range(first, last):
-            begin, there = (row - first) * columns, out[row]
-            p, q = sums[0, begin : begin + columns], sums[1, begin : begin + columns]
-            for j in range(columns):
-                there[j] = amplitude * (p[j] + amplitude * q[j])
+    parts = np.empty((2, out.size))
+    radial_parts(profile, lens, pixels, x_p, y_p, parts)
+    for i in range(out.shape[0]):
+        p, q, there = parts[0, i * out.shape[1] :], parts[1, i * out.shape[1] :], out[i]
+        for j in range(there.size):
+            there[j] = amplitude * (p[j] + amplitude * q[j])
+
+
+@njit(inline="always")
+def _parts(
+    extreme: int, f0r: float, f0i: float, f2r: float, f2i: float, a: float, rho: float,
+    circular: bool, analyzer: bool,
+) -> tuple[float, float]:  # fmt: skip
+    """Linear and quadratic part of the signal in one of the directions that matter.
+
+    At fixed r the signal is a function of cos 2φ, with its extremes at ±1 or where its slope
+    vanishes.  F2 comes multiplied by r².
+    """
+    if circular:
+        other = 0.0 if analyzer else f2r * f2r + f2i * f2i
+        return 2 * rho * a * f0r, a * a * (f0r * f0r + f0i * f0i + other)
+    turn = 1.0 - 2.0 * extreme
+    if extreme == 2:
+        slope = rho * f2r + a * (f0r * f2r + f0i * f2i)
+        sign = -1.0 if a < 0 else 1.0
+        curvature = max(abs(a) * (f2r * f2r + f2i * f2i), 1e-300)
+        turn = min(max(-slope / curvature * sign, -1.0), 1.0)
+    re, im = f0r + turn * f2r, f0i + turn * f2i
+    return 2 * rho * a * re, a * a * (re * re + im * im)
+
+
+@kernel(fastmath=FAST)
+def _add_up(
+    f: FloatArray, inv_step: float, a: float, rho: float, circular: bool, analyzer: bool,
+    extreme: int, sums: FloatArray,
+) -> None:  # fmt: skip
+    """Fill `sums` with the signal at the distances of `f` in one direction."""
+    for j in range(sums.size):
+        square = (f[DISTANCE, j] / inv_step) ** 2
+        linear, quadratic = _parts(
+            extreme, f[0, j], f[1, j], square * f[2, j], square * f[3, j], a, rho,
+            circular, analyzer,
+        )  # fmt: skip
+        sums[j] = linear + quadratic
+
+
+@kernel()
+def largest_signal(
+    profile: FloatArray, inv_step: float, per_step: int, amplitude: float, rho: float,
+    circular: bool, analyzer: bool,
+) -> tuple[float, float]:  # fmt: skip
+    """Parts of the signal of largest magnitude that are linear and quadratic in the amplitude.
+
+    The largest signal on a radial grid of `per_step` points in each interval of the profile is
+    refined by a parabola through its neighbours.
+    """
+    count = per_step * profile.shape[0]
+    f, sums = np.empty((DISTANCE + 1, padded(count))), np.empty(padded(count))
+    for j in range(f.shape[1]):
+        f[DISTANCE, j] = min(j, count - 1) / per_step
+    evaluate(profile, f)
+    at = int(np.int64(0))  # a literal 0 has its own type, for which more is compiled
+    top, node = -1.0, 0.0
+    for extreme in range(1 if circular else 3 if analyzer else 2):
+        _add_up(f, inv_step, amplitude, rho, circular, analyzer, extreme, sums)
+        for j in range(count):
+            if abs(sums[j]) > top:
+                top, at = abs(sums[j]), extreme
+                low, high = sums[max(j - 1, 0)], sums[min(j + 1, count - 1)]
+                curvature = low - 2 * sums[j] + high
+                inside = 0 < j < count - 1 and curvature != 0.0
+                node = (j + (0.5 * (low - high) / curvature if inside else 0.0)) / per_step
+    f = np.empty((DISTANCE + 1, LANES))
+    f[DISTANCE] = node
+    evaluate(profile, f)
+    square = (node / inv_step) ** 2
+    linear, quadratic = _parts(
+        at, f[0, 0], f[1, 0], square * f[2, 0], square * f[3, 0], amplitude, rho, circular, analyzer
+    )
+    return linear, quadratic

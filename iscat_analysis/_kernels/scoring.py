@@ -2,6 +2,13 @@
 
 Parameters and data are those of `iscat_analysis._kernels.noise`, which contains the differences of
 the noise models; `kind` is the number of a noise model.
+
+@@@Profile log-likelihood along z.
+
+At one position and height the signal is a P + a² Q.  The two images are computed once for each
+height, and the amplitude is fitted with them.
+
+@@@The domain of a model: heights of its tables, and pixels within its reach.
 """
 
 from __future__ import annotations
@@ -9,21 +16,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from iscat_analysis._kernels import kernel
-from iscat_analysis._kernels.dense import factorise, solve
-from iscat_analysis._kernels.image import Pixels, signal_gradient, signal_image
-from iscat_analysis._kernels.lattice import FAST, TAPS
-from iscat_analysis._kernels.lattice_rows import lattice_span
-from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, Lens, named_lens
+from iscat_analysis._kernels import FAST, BoolArray, FloatArray, kernel
+from iscat_analysis._kernels.image import signal_gradient, signal_image, signal_parts
+from iscat_analysis._kernels.lattice import TAPS, lattice_span
+from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, Lens, Pixels, named_lens
+from iscat_analysis._kernels.loops import factorise, solve
 from iscat_analysis._kernels.noise import score_of_pixel, value_of_pixels
 from iscat_analysis._kernels.radial import POWERS, AxialTable, profile_at
 from iscat_analysis._kernels.radial_rows import intervals_needed, radial_strip, strip_scratch
 from iscat_analysis._kernels.stamp import STRIP, begin_stamp, stamp_strip
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 CONVERGED, STALLED, EXHAUSTED, ABANDONED = 0, 1, 2, 3
 """Outcome of a fit: step below tolerance; no step improves; iterations used up; little to gain."""
@@ -392,3 +394,120 @@ def maximize(
                 return value, passes, STALLED
             damping = max(10 * damping, 1e-3)
     return value, passes, EXHAUSTED
+
+
+@kernel()
+def scan_heights(
+    table: tuple[Any, ...],
+    optics: tuple[Any, ...],
+    grid: tuple[Any, ...],
+    kind: int,
+    data: FloatArray,
+    heights: FloatArray,
+    amplitude_range: tuple[float, float],
+    theta: FloatArray,
+    values: FloatArray,
+    amplitudes: FloatArray,
+) -> None:
+    """Profile log-likelihood along z at fixed (x, y): the amplitude takes two scoring steps.
+
+    Fills `values` and `amplitudes`, shape (n,), for `heights`; θ gives the other parameters and the
+    start.  An empty amplitude range holds the amplitude fixed.  The first three arguments are those
+    of `maximize`.
+    """
+    axial, lens, pixels = AxialTable(*table), named_lens(optics), Pixels(*grid)
+    profile = blank_profile(axial, lens, 1)
+    here, size = theta.copy(), pixels.y.size * pixels.x.size
+    flat, parts, s = data.reshape(4, size), np.empty((2, size)), np.empty(size)
+    p, q = parts[0], parts[1]
+    low, high = amplitude_range
+    unit, level = theta[3] if theta[3] != 0.0 else 1.0, np.exp(theta[4])
+    for k in range(heights.size):
+        here[2] = heights[k]
+        start, stop = span(lens, pixels, here, axial.heights.shape[3])
+        profile_at(axial, here[2], start, stop, profile)
+        signal_parts(profile, lens, pixels, theta[0], theta[1], unit, parts)
+        a = theta[3]
+        for _ in range(2 if low < high else 0):
+            pull, known = _amplitude(kind, flat, level, a, p, q)
+            if known > 0:
+                a = min(max(a + pull / known, low), high)
+        for j in range(s.size):
+            s[j] = a * (p[j] + a * q[j])
+        values[k] = signal_value(kind, data, level, s)
+        amplitudes[k] = a
+
+
+@kernel(fastmath=FAST)
+def _amplitude(
+    kind: int, data: FloatArray, level: float, a: float, p: FloatArray, q: FloatArray
+) -> tuple[float, float]:
+    """Score about the amplitude, and its information; data has shape (4, n)."""
+    pull = known = 0.0
+    for j in range(p.size):
+        s, slope = a * (p[j] + a * q[j]), p[j] + 2 * a * q[j]
+        score, bend, _ = score_of_pixel(
+            kind, data[0, j], data[1, j], data[2, j], data[3, j], level, s
+        )
+        pull += score * slope
+        known += bend * slope * slope
+    return pull, known
+
+
+SLACK_NM = 1e-6
+"""Tolerance for the rounding of coordinates at the edge of the support."""
+
+
+@kernel()
+def supported(
+    thetas: FloatArray,
+    x: FloatArray,
+    y: FloatArray,
+    half_pixel: float,
+    reach: float,
+    low: float,
+    high: float,
+    largest_level: float,
+) -> BoolArray:
+    """Tell for which θ (n, 5) all pixels are within reach, z is in the table and all is finite."""
+    inside = np.empty(thetas.shape[0], dtype=np.bool_)
+    for k in range(thetas.shape[0]):
+        dx = max(abs(thetas[k, 0] - x[0]), abs(thetas[k, 0] - x[-1])) + half_pixel
+        dy = max(abs(thetas[k, 1] - y[0]), abs(thetas[k, 1] - y[-1])) + half_pixel
+        inside[k] = (
+            np.hypot(dx, dy) <= reach
+            and low - SLACK_NM <= thetas[k, 2] <= high + SLACK_NM
+            and np.isfinite(thetas[k, 3])
+            and abs(thetas[k, 4]) <= largest_level
+        )
+    return inside
+
+
+@kernel()
+def box_supported(
+    start: FloatArray,
+    free: BoolArray,
+    lower: FloatArray,
+    upper: FloatArray,
+    x: FloatArray,
+    y: FloatArray,
+    half_pixel: float,
+    reach: float,
+    low: float,
+    high: float,
+    largest_level: float,
+) -> tuple[bool, bool]:
+    """Tell whether a box contains the start of the free parameters, and is in the support."""
+    inside = True
+    corners = np.empty((4, 5))
+    for i in range(5):
+        if free[i] and not lower[i] <= start[i] <= upper[i]:
+            inside = False
+        for k in range(4):
+            corners[k, i] = start[i]
+        if free[i] and i < 3:
+            corners[0, i], corners[1, i] = lower[i], upper[i]
+            corners[2, i] = lower[i] if i == 0 else upper[i]
+            corners[3, i] = upper[i] if i == 0 else lower[i]
+    known = supported(corners, x, y, half_pixel, reach, low, high, largest_level)
+    return inside, known[0] and known[1] and known[2] and known[3]

@@ -4,7 +4,8 @@ At one height the signal is a P(x, y) + a² Q(x, y), both averaged over a pixel 
 P at k·NA and Q at twice that.  With `fine` samples of P and Q per pixel, an image needs no pupil,
 no fields and no samples inside the pixels.  The samples lie on the grid of the pixels, so that all
 pixels of an image have the same `TAPS`² weights, those of `iscat_analysis.optics.stamp`.  They are
-applied along y first and then along x.
+applied along y first and then along x, with the derivatives of the weights for those of the image:
+s = a S with S = P + a Q, ∂s/∂a = D = P + 2a Q, ∂²s/∂a² = 2Q = 2 (D − S)/a.
 
 A *profile* has shape (2, nodes along y, nodes along x): P and Q.  The nodes along x are ordered by
 their position in a pixel: first the first node of every pixel, then the second, and so on.  The
@@ -20,33 +21,29 @@ long, uses vector registers, and reads from the first cache.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-from iscat_analysis._kernels import kernel
-from iscat_analysis._kernels.lattice import FAST, TAPS
-from iscat_analysis._kernels.lattice_rows import BEFORE, taps
-from iscat_analysis._kernels.mixing import mix, mix_both
-from iscat_analysis._kernels.whole import within
-
-if TYPE_CHECKING:
-    from iscat_analysis._kernels.image import Pixels
-    from iscat_analysis._kernels.lens import StampLens
-
-FloatArray = NDArray[np.float64]
-AnyFloatArray = NDArray[np.floating[Any]]
-IntArray = NDArray[np.int64]
+from iscat_analysis._kernels import FAST, AnyFloatArray, FloatArray, IntArray, kernel
+from iscat_analysis._kernels.lattice import BEFORE, TAPS, taps
+from iscat_analysis._kernels.lens import Pixels, StampLens
+from iscat_analysis._kernels.loops import mix, mix_both, within
 
 STRIP = 16
 """Rows of pixels that are computed at once."""
 
-_WEIGHTS = 4 * TAPS + 3  # weights along x and y, their slopes, the first nodes, the amplitude
+BENDS = 10
+"""Numbers for each pixel: s and its derivatives ∂x, ∂y, ∂xx, ∂a, ∂xy, ∂yy, ∂xa, ∂ya, ∂aa.
+
+The first five are those of `signal_gradient`, with ∂xx in place of ∂z, which does not exist.
+"""
+
+_WEIGHTS = 6 * TAPS + 3  # weights along x and y, two derivatives, the first nodes, the amplitude
+_SIGNAL, _GRADIENT, _BENT = 1, 4, 9  # images: S; ∂xS, ∂yS and D; ∂xxS, ∂xyS, ∂yyS, ∂xD and ∂yD
+_PLACES = (0, 1, 2, 4, 3, 5, 6, 7, 8)  # of the images in a row of pixels
 
 
 @kernel()
-def sizes(lens: StampLens, columns: int) -> tuple[int, int, int, int]:
+def _sizes(lens: StampLens, columns: int) -> tuple[int, int, int, int]:
     """Length of a line, of a block of nodes, of their combinations, and of a strip's pixels."""
     more = (TAPS + lens.fine - 2) // lens.fine
     line = columns + more
@@ -54,7 +51,7 @@ def sizes(lens: StampLens, columns: int) -> tuple[int, int, int, int]:
 
 
 @kernel(_nrt=False)
-def first_nodes(
+def _first_nodes(
     profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float
 ) -> tuple[float, float]:
     """Position of the first pixel on the nodes [nodes]; the nodes of all pixels exist."""
@@ -69,31 +66,26 @@ def first_nodes(
 
 @kernel()
 def begin_stamp(
-    profile: AnyFloatArray,
-    lens: StampLens,
-    pixels: Pixels,
-    x_p: float,
-    y_p: float,
-    amplitude: float,
-) -> AnyFloatArray:
+    profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float,
+    amplitude: float, images: int = _GRADIENT,
+) -> AnyFloatArray:  # fmt: skip
     """Work space of an image, the weights of all of its pixels at the beginning."""
-    _, block, made, strip = sizes(lens, pixels.x.size)
-    w = np.empty(_WEIGHTS + lens.fine * (2 * block + 3 * made) + 4 * strip, profile.dtype)
-    x, y = first_nodes(profile, lens, pixels, x_p, y_p)
-    i, j = int(x), int(y)
-    taps(lens.window, x - i, w[:TAPS], w[TAPS : 2 * TAPS])
-    taps(lens.window, y - j, w[2 * TAPS : 3 * TAPS], w[3 * TAPS : 4 * TAPS])
-    for k in range(TAPS):
-        w[TAPS + k] *= lens.inv_step
-        w[3 * TAPS + k] *= lens.inv_step
-    w[4 * TAPS], w[4 * TAPS + 1], w[4 * TAPS + 2] = i - BEFORE, j - BEFORE, amplitude
+    _, block, made, strip = _sizes(lens, pixels.x.size)
+    size = lens.fine * (2 * block + (1 + images // 2) * made) + images * strip
+    w = np.empty(_WEIGHTS + size, profile.dtype)
+    x, y = _first_nodes(profile, lens, pixels, x_p, y_p)
+    i, j, orders = int(x), int(y), 3 if images == _BENT else 2
+    weights = w[: 6 * TAPS].reshape(2, 3, TAPS)
+    taps(lens.window, x - i, lens.inv_step, weights[0, :orders])
+    taps(lens.window, y - j, lens.inv_step, weights[1, :orders])
+    w[6 * TAPS], w[6 * TAPS + 1], w[6 * TAPS + 2] = i - BEFORE, j - BEFORE, amplitude
     return w
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def copy_nodes(
+def _copy_nodes(
     profile: AnyFloatArray, row: int, step: int, first: int, last: int, line: int,
-    a: np.floating[Any], signal: AnyFloatArray, slope: AnyFloatArray,
+    a: float, signal: AnyFloatArray, slope: AnyFloatArray,
 ) -> None:  # fmt: skip
     """Fill lines of `signal` with P + a Q, of `slope` with P + 2a Q, from every `step`-th row.
 
@@ -115,7 +107,7 @@ def copy_nodes(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def mix_nodes(nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, out: AnyFloatArray) -> None:
+def _mix(nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, out: AnyFloatArray) -> None:
     """Fill `out` with the combination w of the lines that begin at TAPS places of `nodes`."""
     n = out.size
     for k in range(0, TAPS, 4):
@@ -125,11 +117,11 @@ def mix_nodes(nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, out: AnyFloa
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def mix_nodes_both(
+def _mix_both(
     nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, v: AnyFloatArray,
     out: AnyFloatArray, other: AnyFloatArray,
 ) -> None:  # fmt: skip
-    """Fill `out` and `other` with two combinations of the same nodes; see `mix_nodes`."""
+    """Fill `out` and `other` with two combinations of the same nodes; see `_mix`."""
     n = out.size
     for k in range(0, TAPS, 4):
         a, b = nodes[at[k] : at[k] + n], nodes[at[k + 1] : at[k + 1] + n]
@@ -142,51 +134,60 @@ def _make_strip(
     profile: AnyFloatArray, lens: StampLens, row: int, rows: int, columns: int,
     images: int, at: IntArray, w: AnyFloatArray,
 ) -> int:  # fmt: skip
-    """Compute a strip: P + a Q of its pixels, and for 4 images also ∂/∂x, ∂/∂y and P + 2a Q.
+    """Compute the first `images` of a strip, see `_BENT`.
 
     `at` (TAPS) is work space too.  Returns where the strip begins in the other work space; each of
     its images is `STRIP` lines long.
     """
     fine = lens.fine
-    line, block, made, strip = sizes(lens, columns)
-    wx, vx, wy, vy = w[:TAPS], w[TAPS : 2 * TAPS], w[2 * TAPS : 3 * TAPS], w[3 * TAPS : 4 * TAPS]
-    left, top, a = int(w[4 * TAPS]), int(w[4 * TAPS + 1]) + fine * row, w[4 * TAPS + 2]
+    line, block, made, strip = _sizes(lens, columns)
+    weights = w[: 6 * TAPS].reshape(2, 3, TAPS)
+    left, top, a = int(w[6 * TAPS]), int(w[6 * TAPS + 1]) + fine * row, w[6 * TAPS + 2]
     per_phase = profile.shape[2] // fine
     nodes = w[_WEIGHTS : _WEIGHTS + 2 * fine * block]
     sums = w[_WEIGHTS + 2 * fine * block :]
     for k in range(TAPS):
         at[k] = k % fine * block + k // fine * line
-    more, used = line - columns, rows * line
-    kept, gradient = fine * block, images > 1
-    first, size = left // fine, fine * made
+    used, kept, size, first = rows * line, fine * block, fine * made, left // fine
     last = min(first + line, per_phase)
+    value, slope, bend = weights[1, 0], weights[1, 1], weights[1, 2]
     for phase in range(fine):
         for k in range(fine):
             start = k * block
             stop = start + (rows + (TAPS - 1 - k) // fine) * line
-            end = kept + stop if gradient else kept + start
-            copy_nodes(
+            end = kept + stop if images > _SIGNAL else kept + start
+            _copy_nodes(
                 profile, top + k, fine, phase * per_phase + first, phase * per_phase + last, line,
                 a, nodes[start:stop], nodes[kept + start : end],
             )  # fmt: skip
-        start = phase * made
-        here = sums[start : start + used]
-        if not gradient:
-            mix_nodes(nodes[:kept], at, wy, here)
+        s, s_y = phase * made, phase * made + size
+        d, s_yy, d_y = s_y + size, s_y + 2 * size, s_y + 3 * size
+        if images == _SIGNAL:
+            _mix(nodes[:kept], at, value, sums[s : s + used])
             continue
-        mix_nodes_both(nodes[:kept], at, wy, vy, here, sums[start + size : start + size + used])
-        mix_nodes(nodes[kept:], at, wy, sums[start + 2 * size : start + 2 * size + used])
+        _mix_both(nodes[:kept], at, value, slope, sums[s : s + used], sums[s_y : s_y + used])
+        _mix(nodes[kept:], at, value, sums[d : d + used])
+        if images == _BENT:
+            _mix(nodes[:kept], at, bend, sums[s_yy : s_yy + used])
+            _mix(nodes[kept:], at, slope, sums[d_y : d_y + used])
     phase = left % fine
     for k in range(TAPS):
         at[k] = (phase + k) % fine * made + (phase + k) // fine
-    out: int = _WEIGHTS + 2 * fine * block + 3 * fine * made
-    used -= more
-    if not gradient:
-        mix_nodes(sums, at, wx, w[out : out + used])
+    out: int = _WEIGHTS + 2 * fine * block + (1 + images // 2) * size
+    made_images, used = w[out:], used - (line - columns)
+    value, slope, bend = weights[0, 0], weights[0, 1], weights[0, 2]
+    if images == _SIGNAL:
+        _mix(sums, at, value, made_images[:used])
         return out
-    mix_nodes_both(sums, at, wx, vx, w[out : out + used], w[out + strip : out + strip + used])
-    mix_nodes(sums[size:], at, wx, w[out + 2 * strip : out + 2 * strip + used])
-    mix_nodes(sums[2 * size :], at, wx, w[out + 3 * strip : out + 3 * strip + used])
+    _mix_both(sums, at, value, slope, made_images[:used], made_images[strip : strip + used])
+    _mix(sums[size:], at, value, made_images[2 * strip : 2 * strip + used])
+    _mix(sums[2 * size :], at, value, made_images[3 * strip : 3 * strip + used])
+    if images == _BENT:
+        _mix(sums, at, bend, made_images[4 * strip : 4 * strip + used])
+        _mix(sums[size:], at, slope, made_images[5 * strip : 5 * strip + used])
+        _mix(sums[3 * size :], at, value, made_images[6 * strip : 6 * strip + used])
+        _mix(sums[2 * size :], at, slope, made_images[7 * strip : 7 * strip + used])
+        _mix(sums[4 * size :], at, value, made_images[8 * strip : 8 * strip + used])
     return out
 
 
@@ -195,31 +196,40 @@ def stamp_gradient(
     profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float,
     amplitude: float, out: AnyFloatArray,
 ) -> None:  # fmt: skip
-    """Fill `out` (ny, 5, nx) with signal and gradient of an image; ∂s/∂z is 0."""
-    f = begin_stamp(profile, lens, pixels, x_p, y_p, amplitude)
-    _fill_gradient(profile, lens, amplitude, np.empty(TAPS, dtype=np.int64), f, out)
+    """Fill `out` with signal and gradient (ny, 5, nx), ∂s/∂z 0, or second derivatives too.
+
+    These have shape (ny, BENDS, nx).
+    """
+    images = _BENT if out.shape[1] == BENDS else _GRADIENT
+    f = begin_stamp(profile, lens, pixels, x_p, y_p, amplitude, images)
+    _fill_rows(profile, lens, amplitude, images, np.empty(TAPS, dtype=np.int64), f, out)
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _fill_gradient(
-    profile: AnyFloatArray, lens: StampLens, amplitude: float, at: IntArray, f: AnyFloatArray,
-    out: AnyFloatArray,
+def _fill_rows(
+    profile: AnyFloatArray, lens: StampLens, amplitude: float, images: int, at: IntArray,
+    f: AnyFloatArray, out: AnyFloatArray,
 ) -> None:  # fmt: skip
+    """Write all images; a derivative along the particle is minus that along the nodes."""
     rows, n = out.shape[0], out.shape[2]
-    line, _, _, strip = sizes(lens, n)
+    line, _, _, strip = _sizes(lens, n)
+    one, a = out.dtype.type(1.0), out.dtype.type(amplitude)
+    twice = out.dtype.type(2.0 / (amplitude * amplitude) if amplitude else 0.0)
     for row in range(rows):
         if row % STRIP == 0:
-            begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, np.int64(4), at, f)
+            begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, images, at, f)
         here = out[row]
-        for k in range(3):  # one after the other: with ten arrays the compiler uses no vectors
-            made, image = f[begin + k * strip : begin + k * strip + n], here[k]
-            factor = out.dtype.type(-amplitude if k else amplitude)
+        for k in range(images):  # one after the other: with more arrays there would be no vectors
+            made, image = f[begin + k * strip : begin + k * strip + n], here[_PLACES[k]]
+            factor = one if k == 3 else -one if k > 6 else -a if k in (1, 2) else a
             for j in range(n):
                 image[j] = factor * made[j]
-        made, image = f[begin + 3 * strip : begin + 3 * strip + n], here[4]
-        for j in range(n):
-            image[j] = made[j]
-        here[3] = 0.0
+        if images == _BENT:
+            signal, slope, bend = here[0], here[4], here[9]
+            for j in range(n):
+                bend[j] = twice * (a * slope[j] - signal[j])
+        else:
+            here[3] = 0.0
         begin += line
 
 
@@ -233,10 +243,10 @@ def stamp_strip(
     All of its pixels follow one another; ∂s/∂z is 0 and not written.  `f` comes from
     `begin_stamp`, `at` (TAPS) is work space.
     """
-    line, _, _, strip = sizes(lens, columns)
-    begin = _make_strip(profile, lens, row, rows, columns, np.int64(4), at, f)
-    for k in range(4):
-        there = out[4 if k == 3 else k]
+    line, _, _, strip = _sizes(lens, columns)
+    begin = _make_strip(profile, lens, row, rows, columns, np.int64(_GRADIENT), at, f)
+    for k in range(_GRADIENT):
+        there = out[_PLACES[k]]
         factor = out.dtype.type(amplitude if k == 0 else 1.0 if k == 3 else -amplitude)
         for i in range(rows):
             made = f[begin + i * line : begin + i * line + columns]
@@ -252,8 +262,8 @@ def stamp_signal(
     amplitude: float, out: FloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` (ny, nx) with the signal of an image."""
-    f = begin_stamp(profile, lens, pixels, x_p, y_p, amplitude)
-    _put_signal(profile, lens, amplitude, False, np.empty(TAPS, dtype=np.int64), f, out)
+    out[:] = 0.0
+    add_stamp(profile, lens, pixels, x_p, y_p, amplitude, 1.0, out)
 
 
 @kernel()
@@ -263,25 +273,22 @@ def add_stamp(
 ) -> None:  # fmt: skip
     """Add the signal of an image, times a sign, to `out` (ny, nx), in the latter's precision."""
     f = begin_stamp(profile, lens, pixels, x_p, y_p, amplitude)
-    _put_signal(profile, lens, sign * amplitude, True, np.empty(TAPS, dtype=np.int64), f, out)
+    _add_signal(profile, lens, sign * amplitude, np.empty(TAPS, dtype=np.int64), f, out)
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _put_signal(
-    profile: AnyFloatArray, lens: StampLens, factor: float, adds: bool, at: IntArray,
-    f: AnyFloatArray, out: AnyFloatArray,
+def _add_signal(
+    profile: AnyFloatArray, lens: StampLens, factor: float, at: IntArray, f: AnyFloatArray,
+    out: AnyFloatArray,
 ) -> None:  # fmt: skip
-    """Write the signal into `out`, or add it."""
+    """Add the signal row by row."""
     rows, n = out.shape
-    line, by = sizes(lens, n)[0], out.dtype.type(factor)
+    line, by = _sizes(lens, n)[0], out.dtype.type(factor)
     for row in range(rows):
         if row % STRIP == 0:
-            begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, np.int64(1), at, f)
+            high = min(STRIP, rows - row)
+            begin = _make_strip(profile, lens, row, high, n, np.int64(_SIGNAL), at, f)
         s, here = f[begin : begin + n], out[row]
         begin += line
-        if adds:
-            for j in range(n):
-                here[j] += by * s[j]
-        else:
-            for j in range(n):
-                here[j] = by * s[j]
+        for j in range(n):
+            here[j] += by * s[j]

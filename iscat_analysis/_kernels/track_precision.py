@@ -2,65 +2,33 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-from iscat_analysis._kernels import kernel
+from iscat_analysis._kernels import FAST, AnyFloatArray, BoolArray, FloatArray, IntArray, kernel
 from iscat_analysis._kernels.background_response import Slopes, keep_slopes
 from iscat_analysis._kernels.canvas import (
     Canvas,
     Field,
     Light,
     Pictures,
+    Rows,
     cut,
     draw_gradient,
     lens_of,
     square_of,
     stage,
 )
-from iscat_analysis._kernels.dense import factorise
-from iscat_analysis._kernels.image import Pixels
-from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.lens import STAMP, Lens
-from iscat_analysis._kernels.lines import copy_line, largest
-from iscat_analysis._kernels.moving import Room
+from iscat_analysis._kernels.lens import STAMP, Lens, Pixels
+from iscat_analysis._kernels.loops import copy_line, factorise, largest
+from iscat_analysis._kernels.moving import LEAST, Room, place_score
 from iscat_analysis._kernels.noise import FLOOR
-from iscat_analysis._kernels.place_score import LEAST, place_score
-from iscat_analysis._kernels.stamp_bends import BENDS, stamp_bends
-
-FloatArray = NDArray[np.float64]
-AnyFloatArray = NDArray[np.floating[Any]]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
+from iscat_analysis._kernels.stamp import BENDS
 
 PART = 0.5
 """Steps, in standard deviations, of the differences that give second derivatives."""
 
 _SINGULAR = 1e-9
 """Pivot of a matrix with ones on its diagonal below which a parameter is undetermined."""
-
-
-@kernel(fastmath=FAST, _nrt=False)
-def _score_of(data: FloatArray, g: FloatArray, score: FloatArray) -> None:
-    """Fill the four scores of a square whose signal and gradient are g (ny, 5, nx)."""
-    score[:] = 0.0
-    for i in range(data.shape[1]):
-        d0, d1, d2, d3 = data[0, i], data[1, i], data[2, i], data[3, i]
-        s, gx, gy, gz, ga = g[i, 0], g[i, 1], g[i, 2], g[i, 3], g[i, 4]
-        s0 = s1 = s2 = s3 = 0.0
-        for j in range(s.size):
-            rate = max(d1[j] + d2[j] * s[j] + d3[j], FLOOR)
-            pull = d2[j] * (d0[j] / rate - 1.0)
-            s0 += pull * gx[j]
-            s1 += pull * gy[j]
-            s2 += pull * gz[j]
-            s3 += pull * ga[j]
-        score[0] += s0
-        score[1] += s1
-        score[2] += s2
-        score[3] += s3
 
 
 @kernel(fastmath=FAST, _nrt=False)
@@ -123,29 +91,16 @@ def _left_over(
 
 @kernel(_nrt=False)
 def judge_frames(
-    light: Light,
-    field: Field,
-    near: Pictures,
-    free: BoolArray,
-    starts: IntArray,
-    first: int,
-    last: int,
-    theta: FloatArray,
-    group: IntArray,
-    canvas: Canvas,
-    slopes: Slopes,
-    fisher: FloatArray,
-    turned: FloatArray,
-    ways: FloatArray,
-    bias: FloatArray,
-    numbers: FloatArray,
-    room: Room,
-) -> None:
+    light: Light, field: Field, near: Pictures, free: BoolArray, particles: Rows, first: int,
+    last: int, canvas: Canvas, slopes: Slopes, fisher: FloatArray, turned: FloatArray,
+    ways: FloatArray, bias: FloatArray, numbers: FloatArray, room: Room,
+) -> None:  # fmt: skip
     """Fill information, bias and tests of the rows of frames first…last − 1, at θ.
 
     Shapes: `fisher` (rows, 4, 4), `turned, ways` (rows, 4, 4), `bias` (rows, 4), `numbers` (rows,
     6).
     """
+    starts, theta, group = particles
     rows, columns = light.background.shape
     area, index, ways_here = field.side**2, room.free, room.ways
     known, pull, g = room.small[:5], room.small[5], room.pixels[4 * area :]
@@ -159,7 +114,7 @@ def judge_frames(
             pixels = cut(field.pixels, r0, r1, c0, c1)
             m = _rows_drawn(near.lens)
             here = g[: m * ny * nx].reshape(ny, m, nx)
-            _draw(near, lens_of(near, group[r]), group[r], p, pixels, room.profile, here)
+            draw_gradient(near, group[r], p, pixels, room.profile, here)
             data = room.pixels[: 4 * ny * nx].reshape(4, ny, nx)
             stage(light, t, canvas.total[t], here, r0, c0, data)
             keep_slopes(data[2], here, index, slopes, r, (r0, r1, c0, c1), room.line)
@@ -188,23 +143,8 @@ def judge_frames(
 
 @kernel(_nrt=False)
 def _rows_drawn(lens: Lens) -> int:
-    """Give how many numbers `_draw` fills for each pixel."""
+    """Give how many numbers `draw_gradient` is asked for of each pixel."""
     return int(np.int64(BENDS if len(lens) == STAMP else 5))  # a literal has its own type
-
-
-@kernel(_nrt=False)
-def _draw(
-    near: Pictures, lens: Lens, group: int, p: FloatArray, pixels: Pixels, profile: FloatArray,
-    here: AnyFloatArray,
-) -> None:  # fmt: skip
-    """Draw signal and gradient of a row (ny, 5, nx); at one height also its second derivatives.
-
-    These have shape (ny, BENDS, nx).  The type of the lens chooses the compiled branches.
-    """
-    if len(lens) == STAMP:
-        stamp_bends(near.nodes, lens, pixels, p[0], p[1], p[3], here)
-        return
-    draw_gradient(near, group, p, pixels, profile, here)
 
 
 @kernel()
@@ -223,7 +163,7 @@ def _curve(
         return
     low = near.first_nm
     high = low + near.step_nm * (near.heights.shape[1] - 1)
-    trial, ahead, behind = np.empty(5), np.empty(4), np.empty(4)
+    trial, pulls, known = np.empty(5), np.empty((2, 5)), np.empty((5, 5))
     both = room.work[: 10 * ny * nx].reshape(2, ny, 5, nx)
     for k in range(ways.shape[1]):
         for sign in range(2):
@@ -234,10 +174,10 @@ def _curve(
             if free[2]:
                 trial[2] = min(max(trial[2], low), high)
             draw_gradient(near, group, trial, pixels, room.profile, both[sign])
-            _score_of(data, both[sign], ahead if sign == 0 else behind)
+            place_score(data, both[sign], near.lens, pulls[sign], known)
         _add_curvature(data, here, both[0], both[1], bias)
         for a in range(4):
-            turned[a, k] = -(ahead[a] - behind[a]) / (2 * PART)
+            turned[a, k] = -(pulls[0, a] - pulls[1, a]) / (2 * PART)
 
 
 @kernel()

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
 
-from iscat_analysis._kernels.drift import extend, mismatch, shift_equations
+from iscat_analysis._kernels.light import extend, mismatch, shift_equations
 from iscat_analysis.medians import SIGMA_PER_MAD, median_3x3, robust_sigma
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
 

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, find_objects, label, median_filter
 from scipy.special import chdtri
 
-from iscat_analysis._kernels.unsteady import add_image, add_scatter, block_extremes, block_powers
+from iscat_analysis._kernels.light import add_image, add_scatter, block_extremes, block_powers
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.camera import PIXELS_UNSTEADY, TEXT_BURNT_IN

@@ -45,9 +45,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import gammaincc
 
-from iscat_analysis._kernels.curvature import errors_and_bias
 from iscat_analysis._kernels.goodness import count_and_test
-from iscat_analysis._kernels.hessian import ROWS
+from iscat_analysis._kernels.hessian import ROWS, errors_and_bias
 from iscat_analysis.inference.counts import poisson
 from iscat_analysis.inference.heights import HeightPrior
 from iscat_analysis.inference.laws import MANY_COUNTS
@@ -86,8 +85,6 @@ POOLED_COUNTS = 5.0
 
 _LEAST_VARIANCE_RATIO = 0.1  # variance of a sum of squares over that of normal residuals, at least
 _SUSPECTS = 8  # largest residuals whose exact tail is looked up
-_DEPENDENT = 1e-8  # share of a mode outside the fitted directions that counts as none
-_NORMAL = 1e-4  # excess kurtosis that changes no p-value
 
 AWAY = 3.0
 """Standard deviations from the maximum at which the likelihood is looked at."""
@@ -557,8 +554,8 @@ def three_tests(
     rate, tails = np.empty(grid.shape), np.empty((3, _SUSPECTS))
     chi2, pixels, excess, least_rate, mode_chi2, modes, mode_excess, least, count = count_and_test(
         likelihood.noise.code, likelihood.data, math.exp(theta[LEVEL]), rows, grid.x_nm, grid.y_nm,
-        theta, WAIST * optics.wavelength_nm / optics.na, ORDER, free, _DEPENDENT, _NORMAL,
-        MANY_COUNTS, rate, tails,
+        theta, WAIST * optics.wavelength_nm / optics.na, ORDER, free, MANY_COUNTS,
+        rate, tails,
     )  # fmt: skip
     cells = pixels
     if likelihood.noise.pools_few and least_rate < POOLED_COUNTS:

@@ -21,13 +21,19 @@ from functools import cached_property
 
 import numpy as np
 
-from iscat_analysis._kernels.curvature import observed_information
-from iscat_analysis._kernels.image import Pixels
-from iscat_analysis._kernels.lens import Lens
+from iscat_analysis._kernels.hessian import observed_information
+from iscat_analysis._kernels.lens import Lens, Pixels
 from iscat_analysis._kernels.radial import AxialTable
-from iscat_analysis._kernels.scan import scan_heights
-from iscat_analysis._kernels.scoring import CONVERGED, add_prior, maximize, score_pass, value_batch
-from iscat_analysis._kernels.support import box_supported, supported
+from iscat_analysis._kernels.scoring import (
+    CONVERGED,
+    add_prior,
+    box_supported,
+    maximize,
+    scan_heights,
+    score_pass,
+    supported,
+    value_batch,
+)
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import vector_of
 from iscat_analysis.inference.heights import HeightPrior

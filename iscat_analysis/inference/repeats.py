@@ -34,7 +34,7 @@ from scipy.fft import dct
 from scipy.special import ndtri, stdtr, stdtrit
 
 from iscat_analysis._kernels.noise import FLOOR
-from iscat_analysis._kernels.stepping import frame_scores, spreads
+from iscat_analysis._kernels.sliding import frame_scores, spreads
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.records import BoolArray, FloatArray
 

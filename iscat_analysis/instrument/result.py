@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage
 
-from iscat_analysis._kernels.zernike import zernike
+from iscat_analysis._kernels.pupil import zernike
 from iscat_analysis.config import (
     FIELD_TERMS,
     JUMPS,

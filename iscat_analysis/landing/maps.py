@@ -22,8 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.sliding import near_earlier_peaks
-from iscat_analysis._kernels.stepping import add_image
+from iscat_analysis._kernels.sliding import add_image, near_earlier_peaks
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.landing.neighbours import Neighbours, Step
 from iscat_analysis.records import FloatArray, Mapper

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.stepping import add_image, times_change
+from iscat_analysis._kernels.sliding import add_image, times_change
 from iscat_analysis.camera import derivatives
 from iscat_analysis.fitting.context import AnalysisContext, farthest_px
 from iscat_analysis.fitting.events import Region

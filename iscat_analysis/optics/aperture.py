@@ -38,8 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import j1
 
-from iscat_analysis._kernels.pupil import Pupil, gauss_legendre, make_pupil
-from iscat_analysis._kernels.zernike import orders, zernike
+from iscat_analysis._kernels.pupil import Pupil, gauss_legendre, make_pupil, orders, zernike
 from iscat_analysis.config import Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.scatterers import Rod, Sphere

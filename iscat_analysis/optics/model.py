@@ -37,10 +37,9 @@ from typing import Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.curvature import derivatives_between
-from iscat_analysis._kernels.hessian import PAIRS, ROWS, signal_hessian
-from iscat_analysis._kernels.image import Pixels, signal_gradient, signal_image
-from iscat_analysis._kernels.lens import LatticeLens, Lens, RoundLens
+from iscat_analysis._kernels.hessian import PAIRS, ROWS, derivatives_between, signal_hessian
+from iscat_analysis._kernels.image import signal_gradient, signal_image
+from iscat_analysis._kernels.lens import LatticeLens, Lens, Pixels, RoundLens
 from iscat_analysis._kernels.radial import POWERS, AxialTable, profile_between
 from iscat_analysis.config import Optics
 from iscat_analysis.errors import ConfigError

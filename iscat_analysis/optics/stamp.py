@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from iscat_analysis._kernels.image import Pixels, signal_image
+from iscat_analysis._kernels.image import signal_image
 from iscat_analysis._kernels.lattice import DEGREE, TAPS
-from iscat_analysis._kernels.lens import StampLens
+from iscat_analysis._kernels.lens import Pixels, StampLens
 from iscat_analysis.optics.pixels import bandwidth
 from iscat_analysis.records import FloatArray
 

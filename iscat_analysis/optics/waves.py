@@ -24,11 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.hessian import ROWS, signal_hessian
-from iscat_analysis._kernels.image import Pixels, signal_image
+from iscat_analysis._kernels.image import signal_image
 from iscat_analysis._kernels.lattice import (
     FILTER,
     LATTICE_STEP,
     lattice_half,
+    lattice_values,
     radial_waves,
     reach_of_samples,
     sampled,
@@ -36,11 +37,10 @@ from iscat_analysis._kernels.lattice import (
     undo_window,
     window,
 )
-from iscat_analysis._kernels.lattice_rows import lattice_values
-from iscat_analysis._kernels.lens import LatticeLens, RoundLens
-from iscat_analysis._kernels.peak import largest_signal
+from iscat_analysis._kernels.lens import LatticeLens, Pixels, RoundLens
+from iscat_analysis._kernels.pupil import zernike
 from iscat_analysis._kernels.radial import POWERS, STEP, AxialTable, bessel_table, radial_profile
-from iscat_analysis._kernels.zernike import zernike
+from iscat_analysis._kernels.radial_rows import largest_signal
 from iscat_analysis.config import MEASURABLE, Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.last_used import LastUsed, memoize

@@ -190,7 +190,7 @@ def times(state: Prepared) -> tuple[Prepared, list[Finding]]:
     from iscat_analysis.tracking.tracks import judge_times
 
     frames = tracked_frames(state.movie, state.config)
-    return state, [remark(text) for text in judge_times(state.config, frames, state.movie.name)]
+    return state, judge_times(state.config, frames, state.movie.name)
 
 
 def optics(state: Prepared) -> tuple[Prepared, list[Finding]]:

@@ -551,7 +551,7 @@ def reported_rows(
     if not MODES[mode].follows_tracks:
         threshold = found.context.templates.threshold
     elif optics:  # which were tested
-        from iscat_analysis.tracking.tracked_optics import mass_error
+        from iscat_analysis.tracking.optics import mass_error
 
         unfit = mass_error(optics)
     shared = contributions(
@@ -667,17 +667,16 @@ def make_analysis(
     tracks: pd.DataFrame | None = None
     films: tuple[Film, ...] = ()
     if found.followed is not None:
-        from iscat_analysis.tracking.common_motion import warnings_of
-        from iscat_analysis.tracking.tracks import make_films, tracks_of
+        from iscat_analysis.tracking.tracks import common_motion, make_films, tracks_of
 
-        followed, texts = found.followed, list[str]()
-        tracks, track_summary = tracks_of(
+        followed = found.followed
+        tracks, track_summary, of_tracks = tracks_of(
             context, table, followed.windows,
-            masses=followed.masses, ticks=ticks, warn=texts.append, progress=progress,
+            masses=followed.masses, ticks=ticks, progress=progress,
         )  # fmt: skip
         further |= track_summary
-        texts += warnings_of(table, config.camera.frame_rate_hz, ticks)
-        run.report(*map(remark, texts), fixed_height_warning(config, table))
+        run.report(*of_tracks, *common_motion(table, config.camera.frame_rate_hz, ticks))
+        run.report(fixed_height_warning(config, table))
         backgrounds = followed.parts or (followed.windows,)
         films = make_films(context, ready.steady, ready.camera, backgrounds, table, tracks)
         run.clock.lap("tracks")

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera import add_frames
 from iscat_analysis.diagnosis import Noise, Prepared, judge_beside
-from iscat_analysis.findings import remark
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Region
 from iscat_analysis.fitting.field import add_signal
@@ -25,21 +24,20 @@ from iscat_analysis.pipeline.before_after import Background, BeforeAfter, Stored
 from iscat_analysis.pipeline.kinds import Kind, Look, Redraw, candidate_table, with_threshold
 from iscat_analysis.records import EventView, FloatArray, Windows, silent
 from iscat_analysis.threads import threads
-from iscat_analysis.tracking.block_store import row_view
-from iscat_analysis.tracking.dark_field import beside_particles
-from iscat_analysis.tracking.find import find_moving, track_frames
-from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
-from iscat_analysis.tracking.moving import blurred_rows
-from iscat_analysis.tracking.moving_field import (
+from iscat_analysis.tracking.blocks import row_view
+from iscat_analysis.tracking.field import MovingField
+from iscat_analysis.tracking.find import beside_particles, find_moving, track_frames
+from iscat_analysis.tracking.frames import (
     LEAST_FRAMES,
     exposure_of,
     initial_background,
     load_field,
     restore_particle_light,
-    search_frames,
     tracking_context,
 )
+from iscat_analysis.tracking.rows import BackgroundEstimate, Localizations
+from iscat_analysis.tracking.search import search_frames
+from iscat_analysis.tracking.stages import blurred_rows
 
 AROUND = 100
 """Frames that make the background of one frame in which particles move."""
@@ -57,13 +55,11 @@ class FrameByFrame(BeforeAfter):
     ) -> DetectionResult:
         """Fit each frame by itself, and link the fits; see `BeforeAfter`."""
         movie, camera, windows = ready.steady, ready.camera, ground.windows
-        texts: list[str] = []
         found = track_frames(
             ground.context, movie, camera, windows, ground.summary,
             check=checked(movie, camera), pool=pool, progress=run.progress,
-            doubt=ground.doubt, warn=texts.append,
+            doubt=ground.doubt, report=run.report,
         )  # fmt: skip
-        run.report(*map(remark, texts))
         if not windows.n_before:
             noise = _judge_beside_particles(ready, ground.context, windows, found.fits)
             run.report(*noise.findings)

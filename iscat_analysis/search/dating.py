@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfc, logsumexp
 
-from iscat_analysis._kernels.stepping import best_line, frame_scores, one_change, projector
+from iscat_analysis._kernels.sliding import best_line, frame_scores, one_change, projector
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.frames import Patch
 

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.sliding import block_sums, frame_totals, region_sum
-from iscat_analysis._kernels.stepping import part_sums
+from iscat_analysis._kernels.sliding import block_sums, frame_totals, part_sums, region_sum
 from iscat_analysis.camera import Camera
 from iscat_analysis.last_used import LastUsed
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, InPlace, Mapper, PlacedSource

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
-from iscat_analysis._kernels.stepping import ring_heights
+from iscat_analysis._kernels.sliding import ring_heights
 from iscat_analysis.records import FloatArray
 
 SAMPLED = 0.85

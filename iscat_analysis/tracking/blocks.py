@@ -1,229 +1,507 @@
-"""Blocks of frames: how long a movie of moving particles may have one background.
+"""What is kept of finished blocks of frames, pictures of their tracks, and all of them together.
 
-The background of a block of T frames is known to its counting noise, of every pixel the variance
-1/(B T) of its relative light.  Where the stage drifts, the light is that of no frame: the pattern's
-shift s(t) leaves in a frame the relative change ∇B·(s(t) − s̄)/B, on average over the block the
-variance ∇Bᵀ V(T) ∇B/B², V the covariance of s within a block.  Of these two the second is
+Blocks share no frames and no background, so that their rows are independent, and so are the masses
+of their parts of a track: each is that of the exact likelihood of its block, with its variance.
+The D of each part, which sets its blur, is told from that part alone, and its error is in the
+variance of the mass.
 
-    C(T) = T Σ_ij K_ij V_ij(T),   K_ij = ⟨∂_i B ∂_j B/B⟩ over the pixels,
+Of a single frame the noise hides what the model leaves over of a particle; of the mean of a track
+it does not.  What is left over of each frame, moved by whole pixels, is added up for the frames in
+which the particle stands on the same part of a pixel, and the model's picture of a particle that
+stands still is put back there: a picture as of a particle that does not move, with the light of all
+these frames.  The blur is in what is left over already, with the configured optics; another
+microscope changes the blur of a picture by much less than the picture.
 
-times the first.  A steady velocity v has V = v² T²/12, so that both are equal, C = 1, where
-T³ = 12/(K v²); blocks are longer by a factor of 1.7, `MOST_DRIFT_OVER_COUNTING`.
+The frames are put where their own noise says.  Of a frame with the covariance Σ of its place the
+model then leaves over −½ ∂²C:Σ on average, C the contrast (what the wrong place blurs, less twice
+that, because noise and place go together): C blurred by Σ less C, which is put back.
 
-In the noise curve of landing movies, the variance between neighbouring averages of n frames over
-that of the light, the same drift is 1 + K v² n³/2.  But the curve is no measure of it here: where
-particles cover the field all the time, averages differ by the particles in them.  The shift is that
-of all pixels together, and particles hardly pull at it.
+Where heights are fitted no two frames show the same: each is a picture of its own.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from dataclasses import dataclass
+import json
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.camera import Camera, Trajectory, find_defects, follow_pattern, trusted
+from iscat_analysis._kernels.canvas import box_of
+from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config
-from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.ranges import fitted_frames
-from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Mapper
-from iscat_analysis.tracking.moving_field import LEAST_FRAMES
+from iscat_analysis.diagnosis import Noise, judge_beside, smear_warning
+from iscat_analysis.findings import KINDS, Finding
+from iscat_analysis.fitting.context import AnalysisContext
+from iscat_analysis.fitting.results import Followed
+from iscat_analysis.fitting.run import Checkpoint
+from iscat_analysis.inference.counts import poisson
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.instrument.particle_image import ParticleImage
+from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.optics.model import blurred
+from iscat_analysis.optics.parameters import FAINTEST
+from iscat_analysis.records import BoolArray, CountSource, EventView, FloatArray, Progress, Windows
+from iscat_analysis.threads import start_in_thread
+from iscat_analysis.tracking.field import MovingField
+from iscat_analysis.tracking.joint import variances_left
+from iscat_analysis.tracking.linking import (
+    OUTLYING,
+    bridge,
+    link,
+    numbered,
+    typical,
+    typical_error,
+    with_mass,
+)
+from iscat_analysis.tracking.rows import BackgroundEstimate, Localizations
+from iscat_analysis.tracking.stages import TrackedRows, find_rows_and_background
+from iscat_analysis.tracking.table import common_masses, moving_table, table_of_tracks
 
-BYTES = 16
-"""Of memory for each pixel and frame of a block: counts, picture, slopes of the particles."""
+IntArray = NDArray[np.int64]
 
-SHORTEST = 25
-"""Frames of a block at least, where drift makes it short: in fewer, particles hardly leave where
-they are, and are taken for background."""
+PHASES = 3
+"""Parts of a pixel along each axis."""
 
-MOST_DRIFT_OVER_COUNTING = 5.0
-"""Drift over counting noise, C, that a block may have.  A particle pays more for counting noise
-than a pixel does: it stays at a place for many frames and makes the same error in all of them,
-while the errors that a steady drift makes before and after the middle of a block cancel."""
+LEAST_FRAMES = 20
+"""Of a track that is looked at."""
 
-_SUMS = 64  # of frames, at most, between which the pattern is followed
-_LEAST_SUM = 20  # frames in each: particles in them pull at the pattern less, the more there are
-_SUMS_SHARE = 0.25  # of compute.memory_limit_mb, for these sums
-_READ = 64  # frames read at a time
-_SMALLEST_PX = 32  # side of a field in which a pattern is followed
+MOST_TRACKS = 16
+"""The brightest are looked at."""
+
+MOST_SINGLE = 36
+"""Frames of their own that are looked at: each has a height that is searched."""
+
+MOST_SMEARED_NM = 25.0
+"""Spread of the path in a frame of its own that is looked at: of a longer one the picture is no
+longer that of a normal distribution about the mean."""
 
 
 @dataclass(frozen=True)
-class Plan:
-    """How a movie is divided."""
+class Aligned:
+    """Pictures of tracks."""
 
-    spans: tuple[tuple[int, int], ...]
-    moved_px: tuple[float, float] | None = None
-    drift_over_counting: float | None = None
-    drifts: bool = False
+    track: IntArray
+    counts_e: FloatArray
+    light_e: FloatArray
+    read_e2: FloatArray
+    theta: FloatArray
+    frames: IntArray
+
+    def likelihood(self, context: AnalysisContext, number: int) -> Likelihood:
+        """Give the likelihood of a picture of a particle that stands still."""
+        light = self.light_e[number]
+        side = light.shape[0]
+        return poisson(
+            context.model,
+            PixelGrid.region((0, side), (0, side), context.pixel_nm),
+            self.counts_e[number],
+            light,
+            light,
+            extra_variance_e2=self.read_e2[number],
+            masked=light <= 0,
+        )
+
+    def particle_image(self, context: AnalysisContext, number: int) -> ParticleImage:
+        """Give one picture in the form that the measurement of the microscope takes."""
+        likelihood = self.likelihood(context, number)
+        theta = self.theta[number]
+        fit = context.config.fit
+        x, y, z = (float(v) for v in theta[:3])
+        signal = likelihood.signal(theta)
+        return ParticleImage(
+            grid=likelihood.grid, noise=likelihood.noise, data=likelihood.data,
+            x_nm=x, y_nm=y, z_nm=z, mass_kda=float(context.model.scale.mass(theta[3])),
+            snr=float(np.sqrt(np.sum(signal**2 * likelihood.signal_information(signal)))),
+            owner=int(self.track[number]),
+            heights_nm=fit.z_range_nm if fit.mode == "joint" else None,
+        )  # fmt: skip
+
+
+def align(context: AnalysisContext, moving: TrackedRows) -> Aligned:
+    """Superpose the frames of the brightest tracks."""
+    side = _side(context)
+    empty = np.zeros((0, side, side))
+    nothing = np.zeros(0, dtype=np.int64)
+    none = Aligned(nothing, empty, empty, empty, np.zeros((0, 5)), nothing)
+    rows, field = moving.rows, moving.field
+    if not len(rows.frame):
+        return none
+    good = moving.converged & ~moving.close & field.holds(rows.theta)
+    if field.free[2]:
+        good &= (rows.snr > FAINTEST) & (moving.smear_nm < MOST_SMEARED_NM)
+    else:
+        good &= np.isfinite(moving.common.amplitude)[rows.track]
+    chosen = np.flatnonzero(_brightest(rows.track, rows.snr, good))
+    if not len(chosen):
+        return none
+    return _single(context, moving, chosen) if field.free[2] else _summed(context, moving, chosen)
+
+
+def _side(context: AnalysisContext) -> int:
+    """Largest odd side within the fitted square, so that a pixel is in the middle."""
+    return (context.roi_px - 1) // 2 * 2 + 1
+
+
+def _brightest(track: IntArray, snr: FloatArray, good: BoolArray) -> BoolArray:
+    """Choose the rows of the tracks with the most information."""
+    energy = np.bincount(track, weights=np.where(good, snr**2, 0.0))
+    enough = np.bincount(track, weights=good) >= LEAST_FRAMES
+    best = np.argsort(-np.where(enough, energy, -1.0), kind="stable")[:MOST_TRACKS]
+    return np.asarray(good & np.isin(track, best[enough[best]]))
+
+
+def _single(context: AnalysisContext, moving: TrackedRows, chosen: IntArray) -> Aligned:
+    """Take single frames, from all heights alike."""
+    rows = moving.rows
+    ranked = chosen[np.argsort(rows.theta[chosen, 2], kind="stable")]
+    some = np.linspace(0, len(ranked) - 1, min(MOST_SINGLE, len(ranked))).round().astype(np.int64)
+    chosen = np.sort(ranked[some])
+    side, theta = _side(context), rows.theta[chosen].copy()
+    corner = np.rint(theta[:, 1::-1] / context.pixel_nm).astype(np.int64) - side // 2
+    theta[:, :2] -= corner[:, ::-1] * context.pixel_nm
+    sums, owner = np.zeros((len(chosen), 3, side, side)), np.arange(len(chosen))
+    corner = np.ascontiguousarray(corner)
+    moving.field.add_squares(moving.ground, rows, chosen, corner, owner, sums)
+    left, light, read = np.moveaxis(sums, 1, 0)
+    grid = PixelGrid.region((0, side), (0, side), context.pixel_nm)
+    counts = left + light
+    for number, (x, y, z, amplitude, _) in enumerate(theta.tolist()):
+        counts[number] += light[number] * context.model.amplitude_image(grid, x, y, z, amplitude)
+    return Aligned(rows.track[chosen], counts, light, read, theta, np.ones(len(chosen), np.int64))
+
+
+def _summed(context: AnalysisContext, moving: TrackedRows, chosen: IntArray) -> Aligned:
+    """Add up what is left over of rows, by track and part of the pixel."""
+    rows, field, ground = moving.rows, moving.field, moving.ground
+    side, pixel = _side(context), context.pixel_nm
+    places = rows.theta[chosen, :2] / pixel
+    whole = np.rint(places).astype(np.int64)
+    part = np.floor((places - whole + 0.5) * PHASES).clip(0, PHASES - 1).astype(np.int64)
+    key = (rows.track[chosen] * PHASES + part[:, 1]) * PHASES + part[:, 0]
+    keys, index = np.unique(key, return_inverse=True)
+    variance = variances_left(moving.judged.fisher[chosen], np.flatnonzero(field.free[:4]))
+    sums = np.zeros((len(keys), 3, side, side))
+    corner = whole[:, ::-1] - side // 2
+    field.add_squares(ground, rows, chosen, np.ascontiguousarray(corner), index, sums)
+    left, light, read = np.moveaxis(sums, 1, 0)
+    count = np.bincount(index)
+    middle = [np.bincount(index, weights=v) / count for v in (places - whole).T]
+    spread = np.bincount(index, weights=variance[:, :2].mean(axis=1)) / count
+    track = keys // PHASES**2
+    theta = np.zeros((len(keys), 5))
+    theta[:, 0], theta[:, 1] = ((v + side // 2) * pixel for v in middle)
+    theta[:, 2], theta[:, 3] = context.model.height_nm, moving.common.amplitude[track]
+    grid = PixelGrid.region((0, side), (0, side), pixel)
+    counts = left + light
+    for number, (x, y, z, amplitude, _) in enumerate(theta.tolist()):
+        unsure = blurred(context.model, float(spread[number]), upwards=False)
+        counts[number] += light[number] * unsure.amplitude_image(grid, x, y, z, amplitude)
+    return Aligned(track, counts, light, read, theta, count.astype(np.int64))
+
+
+@dataclass(frozen=True)
+class Block:
+    """The results of a block of frames."""
+
+    span: tuple[int, int]
+    rows: Localizations
+    error: float
+    table: pd.DataFrame
+    inside: BoolArray
+    masses: pd.DataFrame
+    views: tuple[EventView, ...]
+    level: FloatArray
+    power: FloatArray
+    total_e: FloatArray
+    used: BoolArray
+    saturated: BoolArray
+    noise: tuple[str, ...] = ()
+    noise_differs: bool = False
+    aligned: Aligned | None = None
 
     @property
     def frames(self) -> int:
-        """Frames of the longest block."""
-        return max(last - first for first, last in self.spans)
+        """Frames in the block."""
+        return self.span[1] - self.span[0]
 
-    @property
-    def summary(self) -> dict[str, Any]:
-        """What ``summary.json`` says of them, under ``"blocks"``."""
-        return {
-            "number": len(self.spans),
-            "frames": self.frames,
-            "drift_px": None if self.moved_px is None else list(self.moved_px),
-            "drift_over_counting": self.drift_over_counting,
-        }
-
-    def message(self, name: str) -> str:
-        """Say why there are several blocks; empty where that needs no message."""
-        if not self.drifts or self.moved_px is None or self.drift_over_counting is None:
-            return ""
-        y, x = self.moved_px
-        text = (
-            f"{name}: the fixed pattern moves, by {x:+.3f} pixels in x and {y:+.3f} in y in all; "
-            f"{len(self.spans)} blocks of {self.frames} frames have backgrounds of their own"
+    def windows(self, camera: Camera) -> Windows:
+        """Put the background and the sum of all frames side by side."""
+        read = self.frames * camera.read_variance_e2((self.used.shape[0], self.used.shape[1]))
+        return Windows(
+            before_e=self.level * self.power.sum(),
+            after_e=self.total_e,
+            n_before=self.frames,
+            n_after=self.frames,
+            power_ratio=1.0,
+            read_variance_before_e2=read,
+            read_variance_after_e2=read,
+            masked=~self.used,
+            saturated=self.saturated,
+            frames_before=self.span,
+            frames_after=self.span,
+            power=np.concatenate([self.power, self.power]),
         )
-        if self.drift_over_counting > MOST_DRIFT_OVER_COUNTING:
-            text += (
-                f", which still change by {self.drift_over_counting:.2g} times their counting "
-                "noise: masses scatter more than their errors say; let the stage settle, or record "
-                "faster"
-            )
-        return text
 
 
-def plan_blocks(
-    movie: FrameSource,
-    config: Config,
-    camera: Camera,
-    *,
-    check: Callable[[NDArray[Any], int], None],
-    span: tuple[int, int] | None = None,
-    mapper: Mapper = map,
-) -> Plan:
-    """Divide a movie into blocks of frames that have a background each."""
-    first, last = span or fitted_frames(movie, config)
-    frames, pixels = last - first, movie.shape[1] * movie.shape[2]
-    room = int(config.compute.memory_limit_mb * 1e6) // (BYTES * pixels)
-    given = None if config.track.block_frames == "auto" else config.track.block_frames
-    longest = given or max(room, LEAST_FRAMES)
-    count = max(1, min(math.ceil(frames / longest), frames // LEAST_FRAMES))
-    needed = math.ceil(frames / count)
-    if needed > room and frames >= LEAST_FRAMES:
-        advice = "raise it" if given is None else "raise it, or lower track.block_frames"
-        raise DataError(
-            f"{movie.name}: a block of {needed} frames takes {BYTES * needed * pixels / 1e6:.0f} "
-            "MB of memory, more than compute.memory_limit_mb = "
-            f"{config.compute.memory_limit_mb}: {advice}"
-        )
-    if given is not None or frames < 2 * SHORTEST or min(movie.shape[1:]) < _SMALLEST_PX:
-        return Plan(_spans(first, last, count))
-    motion, stiffness = follow_light(
-        movie, camera, (first, last), config, check=check, mapper=mapper
-    )
-    if motion is None:
-        return Plan(_spans(first, last, count))
-    shift = motion.at(np.arange(first, last, dtype=float))
-    moved = (float(shift[-1, 0] - shift[0, 0]), float(shift[-1, 1] - shift[0, 1]))
-    unrest = float(np.sum(stiffness * jitter_covariance(motion.shift_px)))
-
-    def cost_of(count: int) -> float:
-        whole = drift_over_counting(shift, stiffness, _spans(0, frames, count))
-        return max(whole - unrest * frames / count, 0.0)
-
-    least, most, cost = count, max(count, frames // SHORTEST), cost_of(count)
-    while cost > MOST_DRIFT_OVER_COUNTING and count < most:
-        count += 1
-        cost = cost_of(count)
-    return Plan(_spans(first, last, count), moved, cost, count > least)
-
-
-def drift_over_counting(
-    shift_px: FloatArray, stiffness: FloatArray, spans: tuple[tuple[int, int], ...]
-) -> float:
-    """Compare what drift makes of backgrounds with their counting noise.
-
-    Shapes: `shift_px` (t, 2), `stiffness` (2, 2).
-    """
-    total = sum(
-        (b - a) ** 2 * float(np.sum(stiffness * np.cov(shift_px[a:b].T, bias=True)))
-        for a, b in spans
-    )
-    return total / sum(b - a for a, b in spans)
-
-
-def follow_light(
-    movie: FrameSource,
+def analyse_block(
+    context: AnalysisContext,
+    movie: CountSource,
     camera: Camera,
     span: tuple[int, int],
-    config: Config,
     *,
+    goes_on: tuple[bool, bool],
     check: Callable[[NDArray[Any], int], None],
-    mapper: Mapper = map,
-) -> tuple[Trajectory | None, FloatArray]:
-    """Measure how the fixed pattern moves through a movie, and its stiffness per squared pixel.
+    pool: ThreadPoolExecutor,
+    progress: Progress,
+    cautious: bool = False,
+) -> Block:
+    """Analyse the particles of a block of frames."""
+    first, frames = span[0], span[1] - span[0]
+    # Nearer to a border than this a track may go on in the next block.
+    near = context.config.track.memory_frames + 1
+    inner = (near if goes_on[0] else 0, frames - near if goes_on[1] else frames)
+    moving = find_rows_and_background(
+        context, movie, camera, span,
+        check=check, pool=pool, progress=progress, inner=inner, cautious=cautious,
+    )  # fmt: skip
+    field, ground, rows = moving.field, moving.ground, moving.rows
 
-    Shapes: `stiffness` (2, 2).
+    def without(count: int) -> FloatArray:
+        pictures.result()  # of which all frames are drawn
+        light: FloatArray = ground.level * ground.power[:count, None, None]
+        return light + field.residual(ground, rows, 0, count)
+
+    if not goes_on[0]:
+        seen = rows.frame + first, rows.theta[:, :2]
+        pictures = start_in_thread(align, context, moving)
+        judged = start_in_thread(
+            judge_beside, context, movie, camera, span, seen, field.used, without
+        )
+    table, inside = moving_table(context, moving, first), field.holds(rows.theta)
+    masses = common_masses(context, moving)
+    best = table.loc[table[inside].groupby("track")["snr"].idxmax()]
+    aligned, noise = None, Noise()
+    if not goes_on[0]:
+        aligned = pictures.result()
+        noise = judged.result().compared_with_fits(table["chi2_reduced"].to_numpy(float))
+        smeared = smear_warning(context.config, table, moving.smear_nm)
+        if smeared:  # what is left over of pictures, far around them, is not the camera's
+            noise = Noise((smeared,))
+    return Block(
+        span=span,
+        rows=replace(rows, frame=rows.frame + first),
+        error=typical_error(moving.judged.fisher) if len(rows.frame) else 0.0,
+        table=table,
+        inside=inside,
+        masses=masses,
+        views=tuple(row_view(field, ground, rows, int(row)) for row in best.index),
+        level=ground.level,
+        power=ground.power,
+        total_e=field.total_e,
+        used=field.used,
+        saturated=field.saturated,
+        noise=tuple(map(_text_of, noise.findings)),
+        noise_differs=noise.differs,
+        aligned=aligned,
+    )
+
+
+def row_view(
+    field: MovingField, ground: BackgroundEstimate, rows: Localizations, mine: int
+) -> EventView:
+    """Draw a particle in one frame."""
+    frame, theta = int(rows.frame[mine]), rows.theta[mine]
+    spans = [
+        box_of(float(centre), field.pixel_nm, field.roi_px, size)
+        for centre, size in zip((theta[1], theta[0]), field.used.shape, strict=True)
+    ]
+    cut = slice(*spans[0]), slice(*spans[1])
+    others = rows.only((rows.frame == frame) & (np.arange(len(rows.frame)) != mine))
+    left, alone = (field.residual(ground, r, frame, frame + 1)[0][cut] for r in (rows, others))
+    light = ground.power[frame] * ground.level[cut]
+    used = field.used[cut]
+    noise = np.sqrt(light + (alone - left) + field.read_e2[cut])
+    blank = np.where(used, 1.0, np.nan)
+    return EventView(
+        event=int(rows.track[mine]),
+        row_px=spans[0][0],
+        column_px=spans[1][0],
+        contrast=blank * alone / light,
+        model=(alone - left) / light,
+        residual=blank * left / noise,
+    )
+
+
+class BlockStore(Checkpoint):
+    """Results of blocks on disk."""
+
+    records = (*Checkpoint.records, Block, Localizations, Aligned)
+
+
+def _text_of(finding: Finding) -> str:
+    """Write a finding as text that `finding_of` reads."""
+    return json.dumps([finding.code, dict(finding.values), finding.where], default=float)
+
+
+def finding_of(text: str) -> Finding:
+    """Read what `_text_of` wrote."""
+    code, values, where = json.loads(text)
+    return KINDS[code](values, where=where)
+
+
+_MASS = ["mass_kda", "sigma_mass_kda", "crb_mass_kda", "told"]
+
+
+@dataclass(frozen=True)
+class Joined:
+    """The tracks and backgrounds of all blocks of a movie."""
+
+    fits: pd.DataFrame
+    views: tuple[EventView, ...]
+    followed: Followed
+
+
+def join_blocks(config: Config, blocks: Sequence[Block], camera: Camera) -> Joined:
+    """Make one result of the blocks of a movie."""
+    numbers = join_tracks(config, blocks)
+    table = table_of_tracks(
+        pd.concat([b.table for b in blocks], ignore_index=True),
+        np.concatenate([n[b.rows.track] for n, b in zip(numbers, blocks, strict=True)]),
+        np.concatenate([b.inside for b in blocks]),
+        config.track.min_frames,
+        parted=len(blocks) > 1,
+    )
+    parts = tuple(block.windows(camera) for block in blocks)
+    masses = combine_masses([b.masses for b in blocks], numbers, table)
+    followed = Followed(_together(blocks, parts), parts if len(parts) > 1 else (), masses)
+    return Joined(table, _views(table, blocks, numbers), followed)
+
+
+def join_tracks(config: Config, blocks: Sequence[Block]) -> list[IntArray]:
+    """Say which tracks of blocks are one particle.
+
+    At a border the last rows of the tracks that end there and the first of those that begin are
+    linked as two frames are, each with the median mass of its track.  A particle may be missed
+    there for as many frames as elsewhere, and one that hardly moves for more.
+
+    Shapes: result (tracks of the block,).
     """
-    first, last = span
-    shape = (movie.shape[1], movie.shape[2])
-    most = int(_SUMS_SHARE * config.compute.memory_limit_mb * 1e6 / (8 * math.prod(shape)))
-    count = max(2, min(_SUMS, most, (last - first) // _LEAST_SUM))
-    spans = _spans(first, last, count)
-    sums, saturated = np.zeros((count, *shape)), np.zeros(shape, dtype=bool)
-
-    def add_up(part: int) -> BoolArray:
-        full = np.zeros(shape, dtype=np.bool_)
-        for start in range(*spans[part], _READ):
-            raw = movie.read(start, min(start + _READ, spans[part][1]))
-            check(raw, start)
-            full |= camera.saturated(raw).any(axis=0)
-            sums[part] += len(raw) * camera.to_electrons(raw.mean(axis=0))
-        return full
-
-    for full in mapper(add_up, range(count)):
-        saturated |= full
-    read = np.broadcast_to(camera.read_variance_e2(shape), shape)
-    usable = ~(saturated | find_defects(sums.sum(axis=0), (last - first) * read))
-    light = sums[:, usable].mean(axis=1) if usable.any() else np.zeros(count)
-    lengths = np.array([high - low for low, high in spans])
-    if not light.sum() > 0:
-        return None, np.zeros((2, 2))
-    power = light * lengths.sum() / light.sum()
-    middle = np.array([(low + high - 1) / 2 for low, high in spans])
-    motion = follow_pattern(sums, power, middle, usable, read, mapper=mapper)
-    inside = trusted(usable)
-    if motion is None or not inside.any() or not np.isfinite(motion.shift_px).all():
-        return None, np.zeros((2, 2))
-    return motion, _stiffness(sums / lengths[:, None, None], read, inside, lengths)
+    sizes = [int(b.rows.track.max(initial=-1)) + 1 for b in blocks]
+    if len(blocks) == 1:
+        return [np.arange(sizes[0])]
+    numbers = [np.arange(n) + sum(sizes[:k]) for k, n in enumerate(sizes)]
+    for k, (one, two) in enumerate(pairwise(blocks)):
+        for before, after in _met(config, one, two):
+            numbers[k + 1][after] = numbers[k][before]
+    rows = [replace(b.rows, track=n[b.rows.track]) for n, b in zip(numbers, blocks, strict=True)]
+    whole = reduce(_both, rows)
+    if not len(whole.frame):
+        return numbers
+    bridged = replace(whole, track=bridge(config, whole))
+    last = numbered(replace(bridged, group=whole.track))  # group: the number that it had
+    final = np.zeros(int(whole.track.max()) + 1, dtype=np.int64)
+    final[last.group] = last.track
+    return [final[n] for n in numbers]
 
 
-def _stiffness(
-    means_e: FloatArray, read_e2: FloatArray, used: NDArray[np.bool_], frames: NDArray[np.int64]
-) -> FloatArray:
-    """Mean of ∂_i B ∂_j B/(B + read noise) over pixels and averages, without that of noise."""
-    total = np.zeros((2, 2))
-    for mean, n in zip(means_e, frames, strict=True):
-        slopes = np.reshape(np.gradient(mean), (2, -1))
-        weight = (used / np.maximum(mean + read_e2, 1.0)).ravel()
-        total += (slopes * weight) @ slopes.T / used.sum()
-        total -= np.eye(2) / (2 * n)  # half the difference of two pixels has half their variance
-    return total / len(means_e)
+def _met(config: Config, one: Block, two: Block) -> list[tuple[int, int]]:
+    """Find pairs of tracks of two blocks, where the second continues the first."""
+    border, memory = two.span[0], config.track.memory_frames
+    ends, begins = _ends(one.rows, -1), _ends(two.rows, 0)
+    ends = ends.only(ends.frame >= border - 1 - memory)
+    begins = begins.only(begins.frame <= border + memory)
+    if not len(ends.frame) or not len(begins.frame):
+        return []
+    both = _both(ends, begins)
+    side = np.repeat([0, 1], [len(ends.frame), len(begins.frame)])
+    places = with_mass(config, both, np.hypot(one.error, two.error) / np.sqrt(2))
+    track = link(side, places, reach_nm=config.track.max_step_nm, memory=0)
+    pairs = []
+    for j in np.flatnonzero(side == 1):
+        for i in np.flatnonzero((side == 0) & (track == track[j])):
+            if both.frame[j] - both.frame[i] - 1 <= memory:
+                pairs.append((int(both.track[i]), int(both.track[j])))
+    return pairs
 
 
-def jitter_covariance(shift_px: FloatArray) -> FloatArray:
-    """Covariance (2, 2) of errors of single shifts, such as bright particles make.
+def _ends(rows: Localizations, which: int) -> Localizations:
+    """First (0) or last (−1) row of every track, with the median mass of the track."""
+    order = np.lexsort((rows.frame, rows.track))
+    edges = np.flatnonzero(np.diff(rows.track[order], prepend=-1, append=-1))
+    chosen = order[edges[:-1] if which == 0 else edges[1:] - 1]
+    return typical(rows).only(chosen)
 
-    It is that of second differences over 6, in which a steady drift does not show.
-    """
-    second_difference = np.diff(shift_px, n=2, axis=0)
-    return second_difference.T @ second_difference / (6 * max(len(second_difference), 1))
+
+def _both(one: Localizations, two: Localizations) -> Localizations:
+    """Join rows, the ones before the others."""
+    return one.joined(two.frame, two.track, two.theta, two.group)
 
 
-def _spans(first: int, last: int, count: int) -> tuple[tuple[int, int], ...]:
-    """Divide a range of frames into parts of equal length."""
-    edges = [first + (last - first) * k // count for k in range(count + 1)]
-    return tuple(pairwise(edges))
+def combine_masses(
+    masses: Sequence[pd.DataFrame], numbers: Sequence[IntArray], table: pd.DataFrame
+) -> pd.DataFrame:
+    """Combine the masses of the parts of tracks by their variances."""
+    if len(masses) == 1:
+        return masses[0][_MASS]
+    parts = pd.concat(masses, ignore_index=True)
+    parts["track"] = np.concatenate([n[m.index] for n, m in zip(numbers, masses, strict=True)])
+    middle = parts["track"].map(table.groupby("track")["mass_kda"].median())
+    near = (parts["mass_kda"] - middle).abs() <= OUTLYING * parts["sigma_mass_kda"]
+    merit = (parts["blur"] + 2 * near).where(parts["mass_kda"].notna(), -1.0)
+    used = parts[(merit >= 0) & (merit >= merit.groupby(parts["track"]).transform("max"))]
+    weight = 1 / used["sigma_mass_kda"] ** 2
+    total = weight.groupby(used["track"]).sum()
+    out = pd.DataFrame(index=pd.Index(np.unique(parts["track"]), name="track"))
+    for name in ("mass_kda", "told"):
+        out[name] = (weight * used[name]).groupby(used["track"]).sum() / total
+    out["sigma_mass_kda"] = out["crb_mass_kda"] = 1 / np.sqrt(total)
+    return out
+
+
+def _views(
+    table: pd.DataFrame, blocks: Sequence[Block], numbers: Sequence[IntArray]
+) -> tuple[EventView, ...]:
+    """Choose the clearest view of each track."""
+    if not len(table):
+        return ()
+    best = table.loc[table.groupby("track")["snr"].idxmax()]
+    edges = np.array([b.span[1] for b in blocks])
+    found = []
+    for row in best.itertuples():
+        k = int(np.searchsorted(edges, row.frame, side="right"))
+        found += [
+            replace(view, event=int(row.track))
+            for view in blocks[k].views
+            if numbers[k][view.event] == row.track
+        ][:1]
+    return tuple(found)
+
+
+def _together(blocks: Sequence[Block], parts: Sequence[Windows]) -> Windows:
+    """Sum the backgrounds and the frames of all blocks."""
+    if len(parts) == 1:
+        return parts[0]
+    frames, span = sum(b.frames for b in blocks), (blocks[0].span[0], blocks[-1].span[1])
+    light: FloatArray = np.concatenate([b.power * b.level[b.used].mean() for b in blocks])
+    power = light / light.mean()
+    return replace(
+        parts[0],
+        before_e=sum((p.before_e for p in parts[1:]), parts[0].before_e),
+        after_e=sum((p.after_e for p in parts[1:]), parts[0].after_e),
+        n_before=frames,
+        n_after=frames,
+        read_variance_before_e2=frames / blocks[0].frames * parts[0].read_variance_before_e2,
+        read_variance_after_e2=frames / blocks[0].frames * parts[0].read_variance_after_e2,
+        masked=np.logical_or.reduce([p.masked for p in parts]),
+        saturated=np.logical_or.reduce([p.saturated for p in parts]),
+        frames_before=span,
+        frames_after=span,
+        power=np.concatenate([power, power]),
+    )

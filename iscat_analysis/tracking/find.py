@@ -2,6 +2,19 @@
 
 `find_moving` learns the background from the frames in which the particles move, block by block;
 `track_frames` takes one that was recorded or is known.
+
+In dark field particles add their light to that of the background.  The background of a pixel that
+is most likely, given the particles, is the mean of what the frames have beside these.  It is found
+in turns: the median of the frames, the particles over it, the light beside the particles, and so on
+until that stands still.  An image is that of the path during the exposure, with the median D of the
+tracks.
+
+Of particles on a membrane the height tells nothing that their masses do not, and a background that
+is learnt with them may take rings for particles at other heights, until no row is described.  Then
+some of the frames are followed once more with all heights where the configuration has them.  That
+is a special case of heights that are free: where it describes what these do not, they were lost,
+and not the optics wrong.  Particles that move along z turn their phase by half within 100 nm, and
+no single height describes them.
 """
 
 from __future__ import annotations
@@ -16,6 +29,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from iscat_analysis.camera import Camera, Check, add_frames, start_power
 from iscat_analysis.config import Config
@@ -27,15 +41,20 @@ from iscat_analysis.diagnosis import (
     pixel_warnings,
 )
 from iscat_analysis.errors import DataError
+from iscat_analysis.findings import Finding, Findings
+from iscat_analysis.findings.camera import MODEL_MISFITS
+from iscat_analysis.findings.tracks import HEIGHTS_SEEM_FIXED, NO_PARTICLE_MOVES
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.events import Event, contrast_image
-from iscat_analysis.fitting.field import fit_field
+from iscat_analysis.fitting.events import Event, Region, contrast_image, photons_scale
+from iscat_analysis.fitting.field import add_signal, fit_field
 from iscat_analysis.fitting.ranges import checked, fitted_frames, measured_windows
 from iscat_analysis.fitting.results import Compared, DetectionResult, Followed, lines_of, view_of
 from iscat_analysis.fitting.run import RESUMPTION_HINT, Run, saying
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.optics.model import PATH_SPREAD, blurred, path_variance_nm2
 from iscat_analysis.records import (
+    BoolArray,
     CountSource,
     EventView,
     FloatArray,
@@ -43,22 +62,159 @@ from iscat_analysis.records import (
     Progress,
     Status,
     Windows,
+    is_event,
     make_rows,
+    silent,
 )
 from iscat_analysis.search.frames import DARK, well_lit
+from iscat_analysis.species.diffusion import estimate_diffusion
+from iscat_analysis.species.tracks import rows_by_track
 from iscat_analysis.threads import start_in_thread, threads
-from iscat_analysis.tracking.block_store import Block, BlockStore, analyse_block
-from iscat_analysis.tracking.blocks import Plan, plan_blocks
-from iscat_analysis.tracking.dark_field import in_turns
-from iscat_analysis.tracking.frame_search import link
-from iscat_analysis.tracking.frame_subset import keep_frames
-from iscat_analysis.tracking.held_height import held_height_warning
-from iscat_analysis.tracking.joining import join_blocks
-from iscat_analysis.tracking.moving_field import refuse_few_frames, tracking_context
+from iscat_analysis.tracking.blocks import Block, BlockStore, analyse_block, finding_of, join_blocks
+from iscat_analysis.tracking.frames import (
+    Plan,
+    exposure_of,
+    keep_frames,
+    plan_blocks,
+    refuse_few_frames,
+    tracking_context,
+)
+from iscat_analysis.tracking.linking import link
+from iscat_analysis.tracking.optics import TrialTracks, learn_from_tracks
 from iscat_analysis.tracking.sizes import sphere_track, table_of_sizes
-from iscat_analysis.tracking.tracked_optics import TrialTracks, learn_from_tracks
+from iscat_analysis.tracking.stages import find_rows_and_background
+from iscat_analysis.tracking.table import loss_to_blur, moving_table
 from iscat_analysis.tracking.tracks import mass_correlation
 from iscat_analysis.trust.null_field import FrameNoise
+
+MOST_REJECTED = 0.5
+"""Share of the rows with free heights beyond which these are doubted."""
+
+FEW_REJECTED = 0.25
+"""Share of the rows at one height up to which it describes them: of membranes a hundredth is."""
+
+_LOOKED_AT = 200  # frames
+_ENOUGH = 30  # rows that tell
+_REJECTED = "|".join([Status.NOT_CONVERGED, Status.AT_BOUND, Status.POOR_FIT])
+
+
+def held_height_warning(
+    config: Config,
+    movie: CountSource,
+    camera: Camera,
+    span: tuple[int, int],
+    fits: pd.DataFrame,
+    *,
+    check: Callable[[NDArray[Any], int], None],
+    pool: ThreadPoolExecutor,
+) -> Finding | None:
+    """Find whether particles seem to stay at one height, where fits with free heights fail."""
+    if config.track.free != "joint" or not len(fits):
+        return None
+    first, last = span[0], min(span[1], span[0] + _LOOKED_AT)
+    free = _rejected(fits[(fits["frame"] >= first) & (fits["frame"] < last)])
+    if free.size == 0 or free.mean() <= MOST_REJECTED:
+        return None
+    track = config.track.model_copy(update={"free": "mass"})
+    config, (_, tall, wide) = config.model_copy(update={"track": track}), movie.shape
+    context = tracking_context(config, (tall, wide), last - first)
+    try:
+        moving = find_rows_and_background(
+            context, movie, camera, (first, last), check=check, pool=pool, progress=silent
+        )
+    except DataError:  # nothing can be followed at one height
+        return None
+    held = _rejected(moving_table(context, moving, first)[moving.field.holds(moving.rows.theta)])
+    if held.size < _ENOUGH or 2 * held.size < free.size or held.mean() > FEW_REJECTED:
+        return None
+    values = {"free": int(free.sum()), "free_of": free.size, "fixed": int(held.sum())}
+    height = {"fixed_of": held.size, "height_nm": context.model.height_nm}
+    return HEIGHTS_SEEM_FIXED({**values, **height}, where=movie.name)
+
+
+def _rejected(rows: pd.DataFrame) -> BoolArray:
+    """Tell which rows the model does not describe."""
+    return np.asarray(rows["flags"].fillna("").str.contains(_REJECTED), dtype=np.bool_)
+
+
+_MOST_TURNS = 12
+_SETTLED = 0.3  # change of the background, in σ of the mass of a track that has all of it
+_LARGEST_FACTOR = 0.8  # of a step to the one before, with which the end is extrapolated
+
+
+Track = Callable[[AnalysisContext, Windows], DetectionResult]
+"""Fits every frame over a background, and links the fits."""
+
+
+def in_turns(
+    config: Config, context: AnalysisContext, windows: Windows, track: Track
+) -> DetectionResult:
+    """Track particles over a background that is learnt with them, from the median of all frames."""
+    sharp, variance_nm2 = context, 0.0
+    upwards = config.track.free == "joint"
+    last: FloatArray | None = None
+    for turn in range(_MOST_TURNS):
+        found = track(context, windows)
+        if found.interrupted:
+            break
+        ground = beside_particles(context, windows, found.fits)
+        error = np.sqrt(np.maximum(ground + windows.read_variance_before_e2, 1.0))
+        step = np.where(windows.masked, 0.0, (ground - windows.before_e) / error)
+        if turn > 1 and math.sqrt(np.sum(step**2)) < _SETTLED:
+            break
+        if last is not None:  # turns come nearer by one factor each, as slowly as particles move
+            factor = np.sum(step * last) / np.sum(last**2)
+            step = step / (1 - min(max(factor, 0.0), _LARGEST_FACTOR))
+        last = step if turn else None
+        windows = replace(windows, before_e=np.maximum(windows.before_e + step * error, 0.0))
+        variance_nm2 = _path_variance_nm2(config, found.fits)
+        near, far = (
+            blurred(model, variance_nm2, upwards=upwards) for model in (sharp.model, sharp.wide)
+        )
+        context = replace(sharp, model=near, wide=far)
+    fits = found.fits
+    path = PATH_SPREAD * loss_to_blur(sharp, variance_nm2, upwards=upwards) * fits["mass_kda"].abs()
+    errors = ("sigma_mass_kda", "crb_mass_kda")
+    wider = {name: np.hypot(fits[name], path) for name in errors}
+    return replace(
+        found,
+        context=replace(sharp, mode="track", config=config),
+        fits=fits.assign(**wider),
+        repeats=(),
+        empty=None,
+    )
+
+
+def beside_particles(context: AnalysisContext, windows: Windows, fits: pd.DataFrame) -> FloatArray:
+    """Give the light of all frames without that of the particles, for as many frames as before.
+
+    Shapes: result (y, x) [e].
+    """
+    rows, columns = windows.after_e.shape
+    field, signal = Region((0, rows), (0, columns)), np.zeros(windows.after_e.shape)
+    known = is_event(fits) & fits["mass_kda"].notna() & fits["x_nm"].notna()
+    for place in fits.loc[known, ["x_nm", "y_nm", "z_nm", "mass_kda"]].to_numpy(float).tolist():
+        add_signal(context, tuple(place), field, signal)
+    one = replace(windows, power_ratio=1 / windows.n_before)  # a frame of the usual light
+    light = windows.after_e - photons_scale(context, one) * signal
+    return np.asarray(np.maximum(light * windows.n_before / windows.n_after, 0.0))
+
+
+def _path_variance_nm2(config: Config, fits: pd.DataFrame) -> float:
+    """Median variance of the paths of long tracks about their means, in an exposure."""
+    rate, exposure_s = exposure_of(config)
+    if config.camera.frame_rate_hz is None:
+        return 0.0
+    found = []
+    for rows in rows_by_track(fits).values():
+        placed = rows.placed()
+        if len(placed.frame) >= config.track.min_frames:
+            d, _ = estimate_diffusion(
+                *placed.positions(), frame_rate_hz=rate, exposure_ms=1e3 * exposure_s
+            )
+            found += [d] * len(placed.frame)
+    return path_variance_nm2(max(float(np.median(found)), 0.0), exposure_s) if found else 0.0
+
 
 _STEPS = 100  # of the progress of a block
 _PATTERN = 6  # places in a frame that are taken for the light's unevenness,
@@ -72,8 +228,7 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
     span = fitted_frames(ready.steady, config)
     kept = keep_frames(ready.steady, camera, span, additive=additive)
     movie, (first, last) = kept.movie, kept.span
-    if kept.message:
-        run.warn(kept.message)
+    run.report(kept.finding)
     run.clock.lap("model")
     check = checked(movie, camera)
     if additive:
@@ -81,11 +236,8 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
     jitter_future = start_in_thread(pattern_jitter_warning, movie, camera, (first, last))
     with threads(config.compute.workers) as pool:
         plan = plan_blocks(movie, config, camera, check=check, span=kept.span, mapper=pool.map)
-    if message := plan.message(movie.name):
-        run.warn(message)
-    jitter_warning = jitter_future.result()
-    if jitter_warning is not None:
-        run.report(replace(jitter_warning, where=movie.name))
+    jitter = jitter_future.result()
+    run.report(plan.finding(movie.name), jitter and replace(jitter, where=movie.name))
     run.clock.lap("background")
     identity = ready.steady.identity if run.partial else ""
     shelves: list[BlockStore] = []
@@ -104,29 +256,23 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
             )  # fmt: skip
             return TrialTracks(config, context, block)
 
-        begun, learned = learn_from_tracks(
-            config, begin, name=movie.name, pool=pool, warn=run.warn, notify=run.notify
-        )
+        begun, learned = learn_from_tracks(config, begin, name=movie.name, pool=pool, run=run)
         config, context = begun.config, begun.context
         blocks, interrupted = track_movie(
             context, movie, camera, plan, shelf(config, run.partial),
             check=check, pool=pool, progress=run.progress, first=begun.block,
         )  # fmt: skip
         joined = join_blocks(config, blocks, camera)
-        if not interrupted and not fixed_height_warning(
-            config, joined.fits
-        ):  # which says it already
-            held = held_height_warning(
+        if not interrupted and not fixed_height_warning(config, joined.fits):
+            fixed = held_height_warning(
                 ready.config, movie, camera, plan.spans[0], joined.fits, check=check, pool=pool
             )
-            if held:
-                run.warn(held)
+            run.report(fixed)
     windows = joined.followed.windows
-    for text in () if jitter_warning else blocks[0].noise:
-        run.warn(text)
-    run.report(*pixel_warnings(*windows.left_out))
+    noise = [] if jitter else [finding_of(text) for text in blocks[0].noise]
+    run.report(*noise, *pixel_warnings(*windows.left_out))
     if not len(joined.fits) and not interrupted:
-        run.warn(f"{movie.name}: {_no_particle_message(context, blocks[0])}")
+        run.report(_nothing_found(context, blocks[0], movie.name))
     run.clock.lap("track")
     found = DetectionResult(
         context=replace(context, mode="track", config=config),
@@ -150,20 +296,19 @@ def _find_in_dark_field(
     refuse_few_frames(movie.name, frames)
     windows = measured_windows(movie, config, camera, span, span, progress=run.progress)
     run.clock.lap("background")
-    said: list[str] = []
+    last = Findings()
     with threads(config.compute.workers) as pool:
 
         def track(context: AnalysisContext, windows: Windows) -> DetectionResult:
-            said.clear()  # only the last turn has the background
+            last.made.clear()  # only the last turn has the background
             return track_frames(
                 context, movie, camera, windows, {},
-                check=checked(movie, camera), pool=pool, progress=run.progress, warn=said.append,
+                check=checked(movie, camera), pool=pool, progress=run.progress, report=last.add,
             )  # fmt: skip
 
         context = tracking_context(config, ready.shape, frames, ready.lines)
         found = in_turns(config, context, windows, track)
-    for text in said:
-        run.warn(text)
+    run.report(*last.made)
     run.clock.lap("track")
     return found
 
@@ -186,18 +331,14 @@ def _with_resumption_hint(shelves: Sequence[BlockStore], plan: Plan) -> Iterator
         raise saying(stop, nothing) from None
 
 
-def _no_particle_message(context: AnalysisContext, block: Block) -> str:
-    """Say why a movie may show no particle: compare its signal with the noise of a frame."""
+def _nothing_found(context: AnalysisContext, block: Block, name: str) -> Finding:
+    """Compare the signal of a particle with the noise of a frame, where no particle was found."""
     model, grid = context.model, PixelGrid.centred(context.roi_px | 1, context.pixel_nm)
     light, mass = float(block.level[block.used].mean()), model.material.mass_kda
     signal = model.image(grid, 0.0, 0.0, model.height_nm, mass)
-    height = math.sqrt(light * float(np.sum(signal**2)))
-    return (
-        f"no particle was found: with {light:.3g} e per pixel and frame, a particle of "
-        f"particle.mass_kda = {mass:.4g} has a signal-to-noise ratio of {height:.2g} in a frame, "
-        f"and the threshold is {context.templates.threshold:.2g}; if there are particles, record "
-        "with more light, or longer exposures"
-    )
+    snr = math.sqrt(light * float(np.sum(signal**2)))
+    values = {"light_e": light, "mass_kda": mass, "snr": snr}
+    return NO_PARTICLE_MOVES({**values, "threshold": context.templates.threshold}, where=name)
 
 
 def track_movie(
@@ -281,7 +422,7 @@ def track_frames(
     pool: ThreadPoolExecutor,
     progress: Progress,
     doubt: str = "",
-    warn: Callable[[str], None],
+    report: Callable[[Finding], None],
 ) -> DetectionResult:
     """Fit each frame after the background, starting from the frame before, and link."""
     first, last = windows.frames_after
@@ -302,7 +443,7 @@ def track_frames(
             events, here = fit_field(context, here, starts=starts, pool=pool)
             if events and noise is None:
                 if cause := misfit_warning(context.config, events):
-                    warn(cause)
+                    report(MODEL_MISFITS({"cause": cause}))
                 elif doubt:
                     _refuse_pattern(doubt, frame, events)
                 read = camera.read_variance_e2((here.after_e.shape[0], here.after_e.shape[1]))

@@ -1,22 +1,189 @@
-"""Linking of rows to tracks, and the rejection of tracks that are no particles."""
+"""Which rows are one particle: links from frame to frame, gaps, extensions, and who is who.
+
+A particle is lost where another comes so near that both make one peak, and where it was so slow
+that the first background took most of it.  The place where it was last seen predicts the next one:
+`extended` fits it there together with its neighbours, which start from their own last places with
+the masses that their tracks have.
+
+Within a resolution two particles make one picture, and the fits of each may go on with the other.
+What they did before and after tells: how fast each diffuses, how far it went meanwhile, and its
+mass.  The evidence of `identified` that a part before a meeting and one after it are of one
+particle is the Bayes factor against two particles that have nothing to do with each other:
+
+- N steps from frame to frame are normal along two axes, of an unknown variance whose inverse is
+  exponential, with the mean 1/b of the movie.  If their squares add up to 2 S, their marginal
+  likelihood is (2π)^−N N! b/(b + S)^(N+1).  The way from one part to the other, in τ frames, is one
+  more step, of τ times the variance; that to another particle leads anywhere within reach.
+- Masses are median amplitudes.  That of n frames has the variance π σ²/2n, and that of what its
+  neighbours do to all of them; masses of two particles differ as those of the movie.
+
+Three may meet when one comes to two that are together.  A track may end in a meeting, and another
+begin there: two particles had one track for a while, or one of them two.  So the parts before and
+after are joined in that way, of all, which has most evidence.  The links weigh something in it, and
+so does that no particle vanishes beside another.
+"""
 
 from __future__ import annotations
 
+import logging
 import math
-from dataclasses import replace
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.moving import link_surely
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.records import BoolArray, FloatArray
-from iscat_analysis.tracking.extension import LEAST_SHARE
-from iscat_analysis.tracking.frame_search import gaps, link
-from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import Judged, Localizations
+from iscat_analysis.tracking.field import MovingField
+from iscat_analysis.tracking.rows import BackgroundEstimate, Judged, Localizations
+
+IntArray = NDArray[np.int64]
+
+LEAST_SNR = 4.0
+"""Signal-to-noise ratio, with its neighbours in place, that a predicted particle needs."""
+
+LEAST_SHARE = 0.5
+"""Of its track's mass that it needs beside another: one particle is not two of half the mass."""
+
+_SWEEPS = 6  # fits in turn of particles that overlap
+# Resolutions λ/NA within which particles are fitted from their predictions
+_MEETING_RESOLUTIONS = 1.5
+_SAME_RESOLUTIONS = 0.25  # resolutions within which two rows are one particle
+
+
+@dataclass(frozen=True)
+class _End:
+    """An open end of a track: the frame of its last row there, and the direction."""
+
+    track: int
+    frame: int
+    direction: int
+
+
+def extended(
+    field: MovingField,
+    ground: BackgroundEstimate,
+    rows: Localizations,
+    *,
+    resolution_nm: float,
+    reach_nm: float,
+) -> tuple[Localizations, int]:
+    """Continue tracks beyond their ends as long as the movie shows their particles."""
+    tracks = int(rows.track.max(initial=-1)) + 1
+    if not tracks:
+        return rows, 0
+    blur = np.zeros(tracks, dtype=np.int64)
+    blur[rows.track] = rows.group
+    frames, typical, ends = _Frames(rows, field.frames), np.zeros(tracks), []
+    for k in range(tracks):
+        mine = np.flatnonzero(rows.track == k)
+        typical[k] = np.median(rows.theta[mine, 3])
+        ends += [_End(k, int(rows.frame[mine[-1]]), 1), _End(k, int(rows.frame[mine[0]]), -1)]
+    refitted: dict[int, Localizations] = {}
+    added = 0
+    meeting, same = _MEETING_RESOLUTIONS * resolution_nm, _SAME_RESOLUTIONS * resolution_nm
+    while ends:
+        proposed: dict[int, dict[int, _End]] = {}
+        for end in ends:
+            t = end.frame + end.direction
+            if not 0 <= t < field.frames or end.track in frames[t]:
+                continue
+            here = frames[end.frame][end.track]
+            newborn = any(
+                k not in frames[end.frame] and np.hypot(*(theta - here)[:2]) < same
+                for k, theta in frames[t].items()
+            )
+            if field.holds(here) and not newborn:
+                proposed.setdefault(t, {})[end.track] = end
+        if not proposed:
+            break
+        trial = _starts(frames, proposed, typical, blur, meeting)
+        fitted, done = field.refit(ground, trial, sweeps=_SWEEPS)
+        good = done & (fitted.snr > LEAST_SNR)
+        ends = []
+        for t, new in proposed.items():
+            of_frame = np.flatnonzero(fitted.frame == t)
+            found = {int(fitted.track[i]): fitted.theta[i] for i in of_frame}
+            sure = {int(fitted.track[i]): bool(good[i]) for i in of_frame}
+            accepted = []
+            for k, end in new.items():
+                theta, last = found[k], frames[end.frame][k]
+                distances = [np.hypot(*(theta - o)[:2]) for j, o in found.items() if j != k]
+                alone = min(distances, default=np.inf) > meeting
+                heavy = theta[3] > LEAST_SHARE * typical[k]
+                step = np.hypot(*(theta - last)[:2])
+                apart = min(distances, default=np.inf) > same
+                if sure[k] and (alone or heavy) and apart and step < reach_nm:
+                    accepted.append(end)
+            if not accepted:
+                continue
+            for k, theta in found.items():
+                if k in frames[t] or k in {end.track for end in accepted}:
+                    frames[t][k] = theta
+            added += len(accepted)
+            refitted[t] = fitted.only(of_frame)
+            ends += [_End(end.track, t, end.direction) for end in accepted]
+    rows = replace(rows, group=blur[rows.track])
+    if not refitted:
+        return rows, 0
+    changed = sorted(refitted)
+    frame = np.array([t for t in changed for _ in frames[t]], dtype=np.int64)
+    track = np.array([k for t in changed for k in frames[t]], dtype=np.int64)
+    theta = np.array([theta for t in changed for theta in frames[t].values()])
+    longer = Localizations.of(frame, track, theta, blur[track]).recalling(rows)
+    longer = longer.recalling(Localizations.together([refitted[t] for t in changed]))
+    others = rows.only(~np.isin(rows.frame, changed))
+    return Localizations.together([others, longer]).in_order(), added
+
+
+class _Frames(dict[int, dict[int, FloatArray]]):
+    """Parameters of every particle by frame and track; an entry is made when it is asked for."""
+
+    def __init__(self, rows: Localizations, frames: int) -> None:
+        super().__init__()
+        self._rows, self._starts = rows, rows.starts(frames)
+
+    def __missing__(self, t: int) -> dict[int, FloatArray]:
+        here = slice(self._starts[t], self._starts[t + 1])
+        tracks, thetas = self._rows.track[here].tolist(), self._rows.theta[here]
+        self[t] = dict(zip(tracks, thetas, strict=True))
+        return self[t]
+
+
+def _starts(
+    frames: _Frames,
+    proposed: dict[int, dict[int, _End]],
+    typical: FloatArray,
+    blur: np.ndarray,
+    meeting_nm: float,
+) -> Localizations:
+    """Give the starting rows of frames into which tracks are extended, with their neighbours."""
+    frame, track, theta = [], [], []
+    for t, new in proposed.items():
+        rows = {k: value.copy() for k, value in frames[t].items()}
+        for k, end in new.items():
+            start = frames[end.frame][k].copy()
+            start[3] = typical[k]
+            for j, other in frames[t].items():
+                if np.hypot(*(other - start)[:2]) < meeting_nm:
+                    rows[j] = frames[end.frame].get(j, other).copy()
+                    rows[j][3] = typical[j]
+            rows[k] = start
+        for k, value in rows.items():
+            frame.append(t)
+            track.append(k)
+            theta.append(value)
+    tracks = np.array(track, dtype=np.int64)
+    return Localizations.of(np.array(frame, dtype=np.int64), tracks, np.array(theta), blur[tracks])
+
 
 OUTLYING = 5.0
 """Standard deviations from its track's mass beyond which a row is not of that particle alone."""
@@ -30,8 +197,6 @@ _MASS_ERROR_FREE_Z = 0.25  # of the mass, where z is free
 _NEAR_RESOLUTIONS = 0.75  # resolutions λ/NA within which two rows may be one particle
 _BRIDGE_FRAMES = 100  # that a slow particle may hide
 _MEETING = 5  # frames before and after two were crowded, in which one of them may be hidden
-
-IntArray = NDArray[np.int64]
 
 
 def linked(
@@ -289,3 +454,373 @@ def numbered(rows: Localizations) -> Localizations:
     numbers[rows.track[first[order]]] = np.arange(first.size)
     track = numbers[rows.track] if len(rows.track) else rows.track
     return replace(rows, track=track).in_order()
+
+
+LEAST_GAIN = 8.0
+"""In log-likelihood, from which on two tracks exchange what comes after a meeting: of pairs that
+were followed rightly, one in e⁸ at most is exchanged by chance.  As much speaks against a particle
+that ends in a meeting in which another begins."""
+
+MERGED_FRAMES = 100
+"""For which two particles may be one picture, and one track."""
+
+_APART_FRAMES = 5  # in which two must be apart before they meet again
+_NEIGHBOURS_FRAMES = 300  # who stay beside each other for longer are met by others one by one
+_LOG_ZERO = -1e9  # in log-likelihood
+_MASS_ERROR = 0.02  # of what neighbours do to all frames of a part, relative
+
+
+def identified(rows: Localizations, *, near_nm: float, error: float) -> Localizations:
+    """Exchange what comes after meetings between tracks where that is far more likely."""
+    track = rows.track.copy()
+    typical = _Typical.of(rows, near_nm, error)
+    meetings = _meetings(rows, near_nm)
+    number = np.repeat(np.arange(len(meetings)), [len(met.rows) for met in meetings])
+    met_rows = np.concatenate([track[:0], *(met.rows for met in meetings)])
+    for k, met in enumerate(meetings):
+        later = met_rows[number > k]
+        labels = np.unique(track[met.rows])
+        sides = [
+            _track_side(rows, track, int(one), met, later, typical) for one in labels if one >= 0
+        ]
+        for path in _chains(sides, typical):
+            _continue_chain(rows, track, path, met)
+    kept = track >= 0
+    group = _groups(rows, track)
+    return Localizations.of(rows.frame[kept], track[kept], rows.theta[kept], group[kept])
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Steps, mass and positions of a track before or after a meeting."""
+
+    steps: float
+    square: float
+    mass: float
+    variance: float
+    frames: IntArray
+    places: FloatArray
+
+
+@dataclass(frozen=True)
+class _Typical:
+    """Prior of a particle: step, mass and its variance, from all particles of the movie."""
+
+    step_nm2: float
+    mass: float
+    variance: float
+    near_nm: float
+    error: float
+
+    @classmethod
+    def of(cls, rows: Localizations, near_nm: float, error: float) -> _Typical:
+        """Estimate it from all rows."""
+        order = np.lexsort((rows.frame, rows.track))
+        next_ = (np.diff(rows.track[order]) == 0) & (np.diff(rows.frame[order]) == 1)
+        step = _variance_nm2(np.diff(rows.theta[order, :2], axis=0)[next_])
+        mass = rows.theta[:, 3] if len(order) else np.zeros(1)
+        least = (1e-3 * near_nm) ** 2  # of what does not move at all
+        return cls(max(step, least), float(np.median(mass)), float(mass.var()), near_nm, error)
+
+    def part(self, rows: Localizations, mine: IntArray) -> _Part | None:
+        """Summarise some rows of a track; None where there are none."""
+        if not mine.size:
+            return None
+        theta, frame = rows.theta[mine], rows.frame[mine]
+        moved = np.diff(theta[:, :2], axis=0)[np.diff(frame) == 1]
+        steps = len(moved) * math.log(2) ** 2  # a median is as good as the mean of so many
+        mass = float(np.median(theta[:, 3]))
+        variance = math.pi / 2 * self.error**2 / len(mine) + (_MASS_ERROR * mass) ** 2
+        square = steps * _variance_nm2(moved)
+        return _Part(steps, square, mass, variance, frame[[0, -1]], theta[[0, -1], :2])
+
+    def evidence(self, before: _Part | None, after: _Part | None) -> float:
+        """Log Bayes factor that two parts are of one particle; 0 where a part is missing."""
+        if before is None or after is None:
+            return 0.0
+        took = int(after.frames[0] - before.frames[1])
+        if took <= 0:
+            return -math.inf  # one particle is not twice in a frame
+        distance_squared = float(((after.places[0] - before.places[1]) ** 2).sum()) / (2 * took)
+        moved = (
+            self._marginal(
+                before.steps + after.steps + 1, before.square + after.square + distance_squared
+            )
+            - self._marginal(before.steps, before.square)
+            - self._marginal(after.steps, after.square)
+            + math.log(self.near_nm**2 / (2 * took))
+        )
+        known = self.variance / (self.variance + before.variance)
+        mass = self.mass + known * (before.mass - self.mass)
+        variance = known * before.variance + after.variance
+        weighed = _normal(after.mass - mass, variance)
+        return moved + weighed - _normal(after.mass - self.mass, self.variance + after.variance)
+
+    def _marginal(self, steps: float, square: float) -> float:
+        """Log-likelihood of steps whatever their variance, but for (2π)^−N."""
+        prior = math.log(self.step_nm2)
+        return math.lgamma(steps + 1) + prior - (steps + 1) * math.log(self.step_nm2 + square)
+
+
+def _variance_nm2(moved: FloatArray) -> float:
+    """Variance of steps along an axis; 0 of none."""
+    return mean_square(moved) / 2 if len(moved) else 0.0
+
+
+def _normal(off: float, variance: float) -> float:
+    """Logarithm of a normal density, but for 2π."""
+    return -(off**2 / variance + math.log(variance)) / 2
+
+
+class _Meeting(NamedTuple):
+    """Rows of the tracks that met, and their pairs, the closest first."""
+
+    rows: IntArray
+    pairs: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Side:
+    """A track in a meeting: its parts before and after, and whether it begins or ends there."""
+
+    track: int
+    first: int
+    last: int
+    before: _Part | None
+    after: _Part | None
+    begins: bool
+    ends: bool
+
+
+def _track_side(
+    rows: Localizations,
+    track: IntArray,
+    one: int,
+    met: _Meeting,
+    later: IntArray,
+    typical: _Typical,
+) -> _Side:
+    """Summarise one track of a meeting; `later` are the rows of the meetings that follow."""
+    mine = np.flatnonzero(track == one)
+    frame = rows.frame[mine]
+    first, last = rows.frame[met.rows[track[met.rows] == one]][[0, -1]].tolist()
+    coming = rows.frame[later[track[later] == one]]
+    until = coming[coming > last].min(initial=int(frame[-1]) + 1)
+    before = typical.part(rows, mine[frame < first])
+    after = typical.part(rows, mine[(frame > last) & (frame < until)])
+    begins, ends = first - frame[0] <= _APART_FRAMES, frame[-1] - last <= _APART_FRAMES
+    return _Side(one, first, last, before, after, bool(begins), bool(ends))
+
+
+def _chains(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
+    """Find tracks whose continuations are exchanged, by the assignment with the most evidence.
+
+    In a chain each track is continued by the rows that the next track has after the meeting.  Where
+    tracks are exchanged in a cycle, as when two are swapped, the first track stands at the end
+    again.
+    """
+    come = [side for side in sides if not side.begins]
+    go = [side for side in sides if not side.ends]
+    if not come or not go:
+        return
+    gain = LEAST_GAIN + np.array([[typical.evidence(a.before, b.after) for b in go] for a in come])
+    linked = np.array([[a is b for b in go] for a in come])
+    # what fits nothing may end or begin here if it does, and else goes on all the same
+    least = np.array([[0.0 if a.ends or b.begins else _LOG_ZERO for b in go] for a in come])
+    worth = np.maximum(gain, least) + LEAST_GAIN / 2 * linked
+    moves: dict[_Side, _Side] = {}
+    for i, j in zip(*scipy.optimize.linear_sum_assignment(worth, maximize=True), strict=True):
+        a, b = come[i], go[j]
+        if not linked[i, j] and gain[i, j] > least[i, j]:
+            moves[a] = b
+    while moves:
+        path = [next((side for side in moves if side not in moves.values()), next(iter(moves)))]
+        while path[-1] in moves:
+            path.append(moves.pop(path[-1]))
+        yield path
+
+
+def _continue_chain(rows: Localizations, track: IntArray, path: list[_Side], met: _Meeting) -> None:
+    """Give each track of a chain the rows that the next one has after the meeting.
+
+    All are cut at one frame, that in which the tracks were closest.
+    """
+    numbers = [side.track for side in path]
+    mine = [np.flatnonzero(track == k) for k in numbers]
+    low, high = max(side.first for side in path), min(side.last for side in path)
+    near = rows.frame[met.pairs[np.isin(track[met.pairs], numbers).all(axis=1), 0]]
+    near = near[(near >= low) & (near <= high)]
+    cut = int(near[0]) if near.size else (low + high) // 2
+    cycle = path[0] is path[-1]
+    end = int(rows.frame[mine[0][-1]]) if path[0].ends and not cycle else -1
+    begin = rows.frame[mine[-1][0]] if path[-1].begins and not cycle else rows.frame[-1] + 1
+    cuts = np.full(len(path), max(end, min(cut, begin - 1)))
+    if begin <= end:  # in these frames there is a track too many
+        both = [own[(rows.frame[own] >= begin) & (rows.frame[own] <= end)] for own in mine]
+        faintest = int(np.argmin([rows.theta[own, 3].sum() for own in both]))
+        track[both[faintest]] = -1
+        cuts[faintest + 1 :] = begin - 1
+    elif not cycle and not path[0].ends:
+        track[mine[0][rows.frame[mine[0]] > cuts[0]]] = numbers[-1]
+    for k in range(1, len(path)):
+        track[mine[k][rows.frame[mine[k]] > cuts[k]]] = numbers[k - 1]
+
+
+class _Pair(NamedTuple):
+    """A time during which two tracks were close: its frames, the tracks and their pairs of rows."""
+
+    first: int
+    last: int
+    tracks: tuple[int, int]
+    rows: IntArray
+
+
+def _meetings(rows: Localizations, near_nm: float) -> list[_Meeting]:
+    """Join close pairs into meetings, sorted by frame."""
+    pairs = sorted(_pairs(rows, near_nm))
+    number = np.arange(len(pairs))
+    for one, two in _of_one(rows, pairs):
+        number[number == number[two]] = number[one]
+    out = []
+    for k in np.unique(number):
+        met = np.concatenate([pairs[i].rows for i in np.flatnonzero(number == k)])
+        apart = np.hypot(*(rows.theta[met[:, 0], :2] - rows.theta[met[:, 1], :2]).T)
+        out.append(_Meeting(np.unique(met), met[np.argsort(apart)]))
+    return sorted(out, key=lambda met: int(met.rows[0]))
+
+
+def _of_one(rows: Localizations, pairs: list[_Pair]) -> Iterator[tuple[int, int]]:
+    """Find pairs of tracks that belong to one meeting.
+
+    Two pairs do if they share a track, at once or shortly after one another.  A track that ends
+    close to another one is taken to be merged with it until a new track begins close to that one.
+    """
+    numbers, firsts = np.unique(rows.track, return_index=True)
+    begins = dict(zip(numbers.tolist(), rows.frame[firsts].tolist(), strict=True))
+    ends = dict(zip(rows.track.tolist(), rows.frame.tolist(), strict=True))  # the last one stays
+    born: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    spans: dict[int, list[tuple[int, int, int]]] = defaultdict(list)
+    for k, pair in enumerate(pairs):
+        for one, other in (pair.tracks, pair.tracks[::-1]):
+            if pair.first - begins[other] <= _APART_FRAMES:
+                born[one].append((pair.first, k))
+    for k, pair in enumerate(pairs):
+        brief = pair.last - pair.first <= _NEIGHBOURS_FRAMES
+        for one, other in (pair.tracks, pair.tracks[::-1]):
+            until = pair.last
+            if ends[other] - pair.last <= _APART_FRAMES:
+                soon = (b for b in born[one] if 0 < b[0] - pair.last <= MERGED_FRAMES)
+                until, parted = next(soon, (until, k))
+                yield k, parted
+            if brief or until > pair.last:
+                spans[one].append((pair.first if brief else pair.last, until, k))
+    for of_track in spans.values():
+        reach, held = -math.inf, -1
+        for first, last, k in sorted(of_track):
+            if first <= reach + _APART_FRAMES:
+                yield held, k
+            reach, held = max(reach, last), k
+
+
+def _pairs(rows: Localizations, near_nm: float) -> Iterator[_Pair]:
+    """Find the times during which two tracks are closer than `near_nm`."""
+    one, two = rows.pairs_within(near_nm).T
+    swapped = rows.track[one] > rows.track[two]
+    one, two = np.where(swapped, two, one), np.where(swapped, one, two)
+    order = np.lexsort((rows.frame[one], rows.track[two], rows.track[one]))
+    one, two = one[order], two[order]
+    frame, tracks = rows.frame[one], np.stack([rows.track[one], rows.track[two]], axis=1)
+    others = (np.diff(tracks, axis=0) != 0).any(axis=1) | (np.diff(frame) > _APART_FRAMES)
+    for run in np.split(np.arange(len(one)), np.flatnonzero(others) + 1):
+        if run.size:
+            first, last = frame[run[[0, -1]]].tolist()
+            of = int(tracks[run[0], 0]), int(tracks[run[0], 1])
+            yield _Pair(first, last, of, np.stack([one[run], two[run]], axis=1))
+
+
+def _groups(rows: Localizations, track: IntArray) -> IntArray:
+    """Give each row the blur that most rows of its new track have."""
+    group = rows.group.copy()
+    for k in np.unique(track[track != rows.track]):
+        mine = track == k
+        group[mine] = np.bincount(rows.group[mine]).argmax()
+    return group
+
+
+def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int) -> IntArray:
+    """Say which positions are one particle.
+
+    Notes
+    -----
+    What has no choice is linked at once, and the rest of each frame by
+    trackpy (D. B. Allan et al., doi:10.5281/zenodo.4682814), after J. C. Crocker and D. G. Grier,
+    J. Colloid Interface Sci. 179, 298 (1996).
+
+    Shapes: `frame` (n,), `places_nm` (n, axes), result (n,).
+    """
+    n = len(frame)
+    track = np.zeros(n, dtype=np.int64)
+    if not n:
+        return track
+    places = np.ascontiguousarray(places_nm, dtype=np.float64)
+    starts = np.searchsorted(frame, np.arange(frame[0], frame[-1] + 2)).astype(np.int64)
+    taken, waiting, doubtful = np.zeros(n, dtype=bool), track.copy(), track.copy()
+    state, t = np.zeros(4, dtype=np.int64), 0
+    while True:
+        t = link_surely(places, starts, t, reach_nm, memory, track, taken, waiting, state, doubtful)
+        if t == starts.size - 1:
+            break
+        _, number, some, others = state.tolist()
+        old, new = doubtful[:some], doubtful[some : some + others]
+        before = _chosen(places[old], places[new], reach_nm)
+        begun = before < 0
+        track[new[begun]] = number + np.arange(np.count_nonzero(begun))
+        last = old[before[~begun]]
+        track[new[~begun]], taken[last] = track[last], True
+        state[1] += np.count_nonzero(begun)
+        t += 1
+    _, first, numbers = np.unique(track, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[numbers]
+
+
+def _chosen(old: FloatArray, new: FloatArray, reach_nm: float) -> IntArray:
+    """Give the old position that trackpy links to each new one, -1 where there is none."""
+    trackpy = load_linker()
+    try:
+        (_, one), (_, two) = trackpy.link_iter(iter([(0, old), (1, new)]), search_range=reach_nm)
+    except trackpy.SubnetOversizeException as trouble:
+        raise DataError(
+            f"too many particles are within track.max_step_nm = {reach_nm:g} of each other to tell "
+            "which is which from frame to frame: lower it to the farthest that one goes, or record "
+            "fewer particles or more frames a second"
+        ) from trouble
+    where = {number: i for i, number in enumerate(one)}
+    return np.array([where.get(number, -1) for number in two], dtype=np.int64)
+
+
+@cache
+def load_linker() -> Any:
+    """Import trackpy without its log messages.
+
+    The import takes about a second, so that it is worth starting it in a thread.
+    """
+    import trackpy
+
+    logging.getLogger("trackpy").setLevel(logging.WARNING)
+    return trackpy
+
+
+def gaps(frame: IntArray, track: IntArray) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
+    """Give the frames inside tracks in which the particle was not found.
+
+    Shapes: `frame, track` (n,), `missed` (m,), `before, after` (m,), `share` (m,).
+    """
+    order = np.lexsort((frame, track))
+    before, after = order[:-1], order[1:]
+    wide = (track[before] == track[after]) & (frame[after] > frame[before] + 1)
+    before, after = before[wide], after[wide]
+    length = frame[after] - frame[before] - 1
+    first = np.cumsum(length) - length  # of the missed frames, that of each gap
+    steps = 1 + np.arange(length.sum()) - np.repeat(first, length)
+    before, after = np.repeat(before, length), np.repeat(after, length)
+    return frame[before] + steps, before, after, steps / (frame[after] - frame[before])

@@ -39,8 +39,8 @@ from iscat_analysis.species.diffusion import (
     hydrodynamic_diameter,
 )
 from iscat_analysis.species.tracks import SLOWED_BY_WALL, Correlation
-from iscat_analysis.tracking.moving_field import exposure_of
-from iscat_analysis.tracking.paths import ALONG, path_shifts_at
+from iscat_analysis.tracking.frames import exposure_of
+from iscat_analysis.tracking.table import ALONG, path_shifts_at
 
 LEAST_ABSORPTION = 1e-6
 """Imaginary part of an index from which a single index does not describe the material."""

@@ -1,10 +1,15 @@
-"""Tables, messages and films of the tracks of mode ``track``."""
+"""Tables, messages and films of the tracks of mode ``track``, and motion that all particles share.
+
+A vibrating stage or beam moves all of them by the same.  Where a frame is missing, all of them go
+as far as in two frames.  Both make D too large, and no single track shows it.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +20,19 @@ from scipy.ndimage import map_coordinates
 from iscat_analysis.camera import Camera, add_frames, start_power
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.findings import Finding, existing
+from iscat_analysis.findings.tracks import (
+    ALL_JUMP,
+    ALL_MOVE_TOGETHER,
+    EXPOSURE_IN_SECONDS,
+    EXPOSURE_UNKNOWN,
+    FRAME_RATE_UNKNOWN,
+    FRAMES_SEEM_DROPPED,
+    MASSES_CHANGE_TOGETHER,
+    SHORT_FOR_D,
+    STEPS_TOO_LONG,
+    TRACKS_CROSS,
+)
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Region, region_likelihood
 from iscat_analysis.fitting.ranges import background_mode
@@ -22,18 +40,179 @@ from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.optics.model import blurred, path_variance_nm2, signals_within
 from iscat_analysis.optics.scatterers import material
 from iscat_analysis.records import (
+    BoolArray,
     Film,
     FloatArray,
     FrameSource,
     Progress,
+    Status,
     TrackStatus,
     Windows,
     track_numbers,
 )
-from iscat_analysis.species.tracks import Correlation, TrackSetup, changes_together, describe_tracks
+from iscat_analysis.species.tracks import (
+    NO_PLACE,
+    Correlation,
+    TrackSetup,
+    changes_together,
+    describe_tracks,
+)
 from iscat_analysis.threads import one_thread_algebra
-from iscat_analysis.tracking.moving_field import exposure_of
+from iscat_analysis.tracking.frames import exposure_of
 from iscat_analysis.units import listed
+
+IntArray = NDArray[np.int64]
+
+FEWEST_PARTICLES = 3
+"""Particles in a pair of frames, at least."""
+
+LEAST_COMMON_SHARE = 0.05
+"""Of the square of a particle's step, what is common to all, from which on it is said."""
+
+MANY_FRAMES_MISSING = 8
+"""Frames missing at once, which are not the run of two or three where single ones are dropped."""
+
+_SOUND = 0.5  # of a track's rows that are ok: others may be two halves of something else
+_LEAST_STEPS = 20  # of a track, which tell how far it goes
+_LEAST_PAIRS = 30  # of frames
+_SIGNIFICANT = 5.0  # standard errors
+_UNLIKELY = 8.0  # of log-likelihood: one good movie in e⁸ at most
+_OTHERS = 7.0  # the same, of all particles but the one that went farthest, which may be another
+_GAPS = (2, 3, 5, 8, 13, 20, 30, 50, 80)
+_LONGEST = 4.0  # standard deviations of a step that counts
+_CLIPPED = 4.0  # |step|²/2v: no single particle, which may be lost, decides over all
+_SHARES = np.linspace(0.005, 0.5, 100)
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """Steps from a frame to the next, in the order of the frames."""
+
+    frame: IntArray
+    """Number of the pair of frames, from 0."""
+    numbers: IntArray
+    """Of each pair, that of its second frame in the movie."""
+    step: FloatArray
+    """Along x and y [nm], shape (n, 2)."""
+    variance: FloatArray
+    """Of the steps of this track along each axis [nm²]."""
+
+    def total(self, values: FloatArray) -> FloatArray:
+        """Add up what belongs to each pair of frames."""
+        sums = np.bincount(self.frame, weights=values, minlength=len(self.numbers))
+        return sums.astype(np.float64)
+
+
+def common_motion(
+    fits: pd.DataFrame, frame_rate_hz: float | None, ticks: IntArray | None = None
+) -> list[Finding]:
+    """Find motion that all particles share; `ticks` (t,) tells which frames are missing."""
+    steps = _steps_of(fits, ticks)
+    if steps is None:
+        return []
+    shaken = _shared_steps(steps, frame_rate_hz)
+    jumps, dropped = _jumps(steps), _dropped(steps)
+    if many := [jump for missing, jump in jumps if missing >= MANY_FRAMES_MISSING]:
+        others = many
+    elif dropped and not shaken:
+        others = [dropped]
+    else:
+        others = [jump for _, jump in jumps]
+    return existing([shaken, *others])
+
+
+def _steps_of(fits: pd.DataFrame, ticks: IntArray | None) -> _Steps | None:
+    """Gather the steps of all tracks; None where too few particles are seen at once."""
+    sound = fits["status"].eq(Status.OK).groupby(fits["track"]).transform("mean") > _SOUND
+    good = fits.loc[sound & ~fits["status"].isin(NO_PLACE), ["track", "frame", "x_nm", "y_nm"]]
+    good = good.sort_values(["track", "frame"])
+    step = good.diff()
+    next_ = ((step["track"] == 0) & (step["frame"] == 1)).to_numpy()
+    if ticks is not None:
+        next_ = next_ & (np.diff(ticks[good["frame"].to_numpy(int)], prepend=-1) == 1)
+    xy = step.loc[next_, ["x_nm", "y_nm"]].to_numpy(float)
+    track, frame = (good.loc[next_, name].to_numpy(dtype=np.int64) for name in ("track", "frame"))
+    variance = np.full(len(track), np.nan)
+    for k in np.unique(track):
+        mine = track == k
+        if mine.sum() >= _LEAST_STEPS:
+            variance[mine] = np.median((xy[mine] ** 2).sum(axis=1)) / (2 * math.log(2))
+    used = variance > 0
+    numbers, count = np.unique(frame[used], return_counts=True)
+    numbers = numbers[count >= FEWEST_PARTICLES]
+    used &= np.isin(frame, numbers)
+    if len(numbers) < _LEAST_PAIRS:
+        return None
+    order = np.flatnonzero(used)[np.argsort(frame[used], kind="stable")]
+    pair = np.searchsorted(numbers, frame[order]).astype(np.int64)
+    return _Steps(pair, numbers.astype(np.int64), xy[order], variance[order])
+
+
+def _shared_steps(steps: _Steps, frame_rate_hz: float | None) -> Finding | None:
+    """Find whether all particles move by the same from frame to frame.
+
+    The variance of the common step is the mean product of the steps of two different particles.
+    """
+    length = np.hypot(*steps.step.T) / np.sqrt(steps.variance)
+    cut = steps.step * np.minimum(1, _LONGEST / np.maximum(length, _LONGEST))[:, None]
+    weight = 1 / steps.variance
+    both = [steps.total(weight * cut[:, k]) ** 2 for k in (0, 1)]
+    own = steps.total(weight**2 * (cut**2).sum(axis=1))
+    pairs = steps.total(weight) ** 2 - steps.total(weight**2)
+    product = both[0] + both[1] - own
+    mean, error = product.mean(), product.std() / math.sqrt(len(product))
+    common = float(product.sum() / (2 * pairs.sum()))  # variance along each axis
+    if mean < _SIGNIFICANT * error or common < LEAST_COMMON_SHARE * np.median(steps.variance):
+        return None
+    by = ""
+    if frame_rate_hz is not None:
+        by = f", by up to {1e-6 * common * frame_rate_hz / 2:.2g} um2/s"
+    return ALL_MOVE_TOGETHER({"step_nm": math.sqrt(common), "by": by})
+
+
+def _normalized_squares(steps: _Steps) -> tuple[FloatArray, FloatArray]:
+    """Give |step|²/2v of each step, 1 on average, and the number of steps of each frame pair."""
+    square = (steps.step**2).sum(axis=1) / (2 * steps.variance)
+    return square, steps.total(np.ones(len(steps.frame)))
+
+
+def _jumps(steps: _Steps) -> list[tuple[int, Finding]]:
+    """Find frames between which all particles go so far that frames must be missing."""
+    surprise, particles = _normalized_squares(steps)
+    total = steps.total(surprise)
+    largest = np.zeros(len(total))
+    np.maximum.at(largest, steps.frame, surprise)
+    most, others = np.zeros(len(total)), np.zeros(len(total))
+    missing = np.zeros(len(total), dtype=np.int64)
+    for gap in _GAPS:
+        gain = total * (1 - 1 / gap) - particles * math.log(gap)
+        missing[gain > most] = gap - 1
+        most = np.maximum(most, gain)
+        rest = (total - largest) * (1 - 1 / gap) - (particles - 1) * math.log(gap)
+        others = np.maximum(others, rest)
+    found: BoolArray = (most > _UNLIKELY + math.log(len(total))) & (others > _OTHERS)
+    out = []
+    for k in np.flatnonzero(found)[:3].tolist():
+        number, gap = int(steps.numbers[k]), int(missing[k])
+        values = {"before": number - 1, "frame": number, "steps": gap + 1, "missing": gap}
+        out.append((gap, ALL_JUMP({**values, "particles": int(particles[k])})))
+    return out
+
+
+def _dropped(steps: _Steps) -> Finding | None:
+    """Find whether many single frames are missing."""
+    surprise, particles = _normalized_squares(steps)
+    clipped = np.minimum(surprise, _CLIPPED)
+    # mean of exp(½ min(e, c)) over e of mean 1: what the clipped odds must be divided by
+    norm = 2 - math.exp(-_CLIPPED / 2)
+    gain = steps.total(clipped) / 2 - particles * math.log(norm)
+    odds = np.exp(np.minimum(gain, 50.0))
+    likely = np.log1p(_SHARES[:, None] * (odds - 1)).sum(axis=1)
+    best = int(np.argmax(likely))
+    if likely[best] < _UNLIKELY:
+        return None
+    return FRAMES_SEEM_DROPPED({"pairs": len(particles), "share": float(_SHARES[best])})
+
 
 SHORT_MOVIE = 20
 """Fewer frames than this hardly tell a diffusion coefficient."""
@@ -53,45 +232,40 @@ _ENOUGH = 5.0  # steps of one axis: 4 in 10⁶ in the plane are longer
 _LEAST_ABSORPTION = 1e-6  # of a permittivity, where a refractive index says it all no more
 
 
-def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
-    """Say what the frame rate, exposure and length of a movie leave unknown about its tracks."""
+def judge_times(config: Config, frames: int, name: str) -> list[Finding]:
+    """Find what the frame rate, exposure and length of a movie leave unknown about its tracks."""
+    found = []
     rate, exposure = config.camera.frame_rate_hz, config.camera.exposure_ms
     if rate is None:
         others = "positions and masses do not need it"
         if config.fits_sizes:
             others = "spheres are fitted as if they rested, and if they move, diameters are wrong"
-        yield (
-            "camera.frame_rate_hz is not known, so that there is no diffusion coefficient: add it, "
-            f"as in camera.frame_rate_hz = 331.0; {others}"
-        )
+        found.append(FRAME_RATE_UNKNOWN({"others": others}))
     elif exposure is None:
-        yield (
-            f"camera.exposure_ms is not known and taken as the {1e3 / rate:.3g} ms from frame to "
-            "frame, over which motion is averaged: add it if it is shorter"
-        )
+        found.append(EXPOSURE_UNKNOWN({"interval_ms": 1e3 / rate}))
     elif exposure > 1e3 / rate * (1 + _ROUNDING):
         raise ConfigError(
             f"camera.exposure_ms = {exposure:g} is longer than the {1e3 / rate:.4g} ms from frame "
             f"to frame at camera.frame_rate_hz = {rate:g}: correct one of them"
         )
     elif exposure <= (1 + _ROUNDING) / rate:
-        yield (
-            f"camera.exposure_ms = {exposure:g} is no more than a thousandth of the "
-            f"{1e3 / rate:.4g} ms from frame to frame: if it is in seconds, write "
-            f"{1e3 * exposure:g}, since motion during the exposure blurs pictures and changes D"
-        )
-    if background_mode(config) == "tracks" and frames < config.track.min_frames:
+        values = {"exposure_ms": exposure, "interval_ms": 1e3 / rate}
+        found.append(EXPOSURE_IN_SECONDS({**values, "written_ms": 1e3 * exposure}))
+    learnt = config.background.way == "tracks"
+    if learnt and frames < config.track.min_frames:
         raise ConfigError(
             f"track.min_frames = {config.track.min_frames} is more than the {frames} frames of "
             f"{name} that are tracked, so that no track is long enough: lower it"
         )
     # A movie without any is refused, as is one of few frames whose background is learnt.
-    if 0 < frames < SHORT_MOVIE and background_mode(config) != "tracks":
-        best = 100 / np.sqrt(max(frames - 1, 1))
-        text = f"{name}: {frames} frames tell no diffusion coefficient better than to {best:.0f} %"
+    if 0 < frames < SHORT_MOVIE and not learnt:
+        none = ""
         if frames < config.track.min_frames:
-            text += f", and none at all below track.min_frames = {config.track.min_frames}"
-        yield f"{text}; record more, at least {SHORT_MOVIE}"
+            none = f", and none at all below track.min_frames = {config.track.min_frames}"
+        percent = 100 / math.sqrt(max(frames - 1, 1))
+        values = {"frames": frames, "percent": percent, "least": SHORT_MOVIE}
+        found.append(SHORT_FOR_D({**values, "none_at_all": none}, where=name))
+    return found
 
 
 def tracks_of(
@@ -101,10 +275,9 @@ def tracks_of(
     *,
     masses: pd.DataFrame | None,
     ticks: NDArray[np.int64] | None,
-    warn: Callable[[str], None],
     progress: Progress,
-) -> tuple[pd.DataFrame, dict[str, Any]]:
-    """Describe the tracks of a movie."""
+) -> tuple[pd.DataFrame, dict[str, Any], list[Finding]]:
+    """Describe the tracks of a movie, with entries of its summary and what is found."""
     setup = replace(track_setup(context, windows), ticks=ticks)
     setup = replace(setup, change=changes_together(fits, setup.frames))
     with one_thread_algebra():
@@ -117,19 +290,15 @@ def tracks_of(
             workers=context.config.compute.workers,
             progress=progress,
         )
-    if setup.change:
-        warn(
-            f"the masses of all tracks change together, by {100 * setup.change:.2g} % in these "
-            "frames, as where the focus drifts: tracks whose masses it changes by more than their "
-            "errors are flagged mass_varies; hold the focus, or analyse fewer frames (fit.frames)"
-        )
+    found = [cut_steps(tracks, setup, context.config.track.max_step_nm)]
     met = tracks[tracks["nearest_nm"] < setup.near_nm]
     if len(met):
-        warn(_crossings(met, setup))
-    cut = cut_steps(tracks, setup, context.config.track.max_step_nm)
-    if cut:
-        warn(cut)
-    return tracks, {"tracks": len(tracks), "motion": _summary(tracks, setup)}
+        values = {"limit_nm": setup.near_nm, "nearest_nm": float(met["nearest_nm"].min())}
+        found.insert(0, TRACKS_CROSS({**values, "tracks": listed(met["track"], _NAMED)}))
+    if setup.change:
+        found.insert(0, MASSES_CHANGE_TOGETHER({"percent": 100 * setup.change}))
+    summary = {"tracks": len(tracks), "motion": _summary(tracks, setup)}
+    return tracks, summary, existing(found)
 
 
 def track_setup(context: AnalysisContext, windows: Windows) -> TrackSetup:
@@ -198,34 +367,22 @@ def mass_correlation(context: AnalysisContext, fits: pd.DataFrame) -> Correlatio
     return correlation
 
 
-def _crossings(met: pd.DataFrame, setup: TrackSetup) -> str:
-    """List pairs of tracks that came close to each other."""
-    return (
-        f"tracks {listed(met['track'], _NAMED)} come nearer than {setup.near_nm:g} nm to another "
-        f"(to {met['nearest_nm'].min():.0f} nm), where masses are shared and numbers may be "
-        "exchanged: they are flagged crosses; record fewer particles to avoid it"
-    )
-
-
-def cut_steps(tracks: pd.DataFrame, setup: TrackSetup, reach_nm: float) -> str:
-    """Say where D is too small because long steps cannot be linked; empty where it hardly is.
+def cut_steps(tracks: pd.DataFrame, setup: TrackSetup, reach_nm: float) -> Finding | None:
+    """Find whether D is too small because long steps cannot be linked.
 
     Steps in the plane of variance s² along each axis exceed R with p = exp(−R²/2s²).  Without these
     their mean square is less by the share R²/2s² p/(1 − p).
     """
     d = tracks.loc[tracks["status"] == TrackStatus.OK, "d_um2_s"].max()
     if setup.frame_rate_hz is None or not d > 0:
-        return ""
+        return None
     step = 1e3 * float(np.sqrt(2 * d / setup.frame_rate_hz))
     ratio = reach_nm**2 / (2 * step**2)
     longer = float(np.exp(-ratio))
     if ratio * longer / (1 - longer) < _TRUNCATED:
-        return ""
-    return (
-        f"particles move {step:.0f} nm from frame to frame along each axis, so that "
-        f"{100 * longer:.2g} % of steps are longer than track.max_step_nm = {reach_nm:g}: they cut "
-        f"tracks and make D too small; set it to {_ENOUGH * step:.0f}"
-    )
+        return None
+    values = {"step_nm": step, "reach_nm": reach_nm, "enough_nm": _ENOUGH * step}
+    return STEPS_TOO_LONG({**values, "percent": 100 * longer})
 
 
 def _summary(tracks: pd.DataFrame, setup: TrackSetup) -> dict[str, Any]:

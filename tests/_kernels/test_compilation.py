@@ -137,7 +137,7 @@ def test_cycles_are_looked_for_again_once_a_kernel_is_compiled():
     assert gc.isenabled()
     with compiling(print):
         with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.sliding")):
-            with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.lines")):
+            with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.loops")):
                 pass
             assert not gc.isenabled()
         assert gc.isenabled()
@@ -146,14 +146,14 @@ def test_cycles_are_looked_for_again_once_a_kernel_is_compiled():
 @pytest.mark.large
 def test_a_picture_is_compiled_without_those_of_other_kinds(tmp_path):
     code = """
-from iscat_analysis._kernels.lattice_rows import lattice_signal
+from iscat_analysis._kernels.lattice import lattice_row
 from iscat_analysis._kernels.radial_rows import radial_signal
 from iscat_analysis._kernels.stamp import stamp_signal
 from iscat_analysis.config import Config
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 model = forward_model(Config(), 2000.0)
 model.amplitude_image(PixelGrid.region((0, 3), (0, 3), 10.0), 10.0, 10.0, 5.0, 1.0)
-print(*(len(kernel.signatures) for kernel in (radial_signal, lattice_signal, stamp_signal)))
+print(*(len(kernel.signatures) for kernel in (radial_signal, lattice_row, stamp_signal)))
 """
     done = subprocess.run(
         [sys.executable, "-c", code], env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},

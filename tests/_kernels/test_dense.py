@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from iscat_analysis._kernels.curvature import invert
-from iscat_analysis._kernels.dense import factorise
+from iscat_analysis._kernels.hessian import invert
+from iscat_analysis._kernels.loops import factorise
 from iscat_analysis._kernels.scoring import scoring_step
 
 UNITS = np.array([1e-3, 2e-3, 5e-4, 40.0, 1.0])  # of numbers as different as nm and amplitudes

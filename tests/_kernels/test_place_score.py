@@ -7,8 +7,8 @@ import pytest
 
 from iscat_analysis._kernels.lattice import DEGREE, TAPS
 from iscat_analysis._kernels.lens import RoundLens, StampLens
+from iscat_analysis._kernels.moving import place_score
 from iscat_analysis._kernels.noise import POISSON
-from iscat_analysis._kernels.place_score import place_score
 from iscat_analysis._kernels.scoring import image_score, image_value
 
 ROUNDING = 1e-11  # of sums over pixels in another order

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from iscat_analysis._kernels.quintics import (
+from iscat_analysis._kernels.radial_rows import (
     DISTANCE,
     evaluate,
     evaluate_bends,

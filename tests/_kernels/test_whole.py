@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from iscat_analysis._kernels.lattice import radial_waves, sum_waves
+from iscat_analysis._kernels.loops import whole, within
 from iscat_analysis._kernels.mixture import mixture_score
-from iscat_analysis._kernels.whole import whole, within
 
 
 @pytest.mark.parametrize("x", [math.nan, math.inf, -math.inf, 1e300, -1e300, 2.0**63, -(2.0**63)])

@@ -23,7 +23,7 @@ from iscat_analysis.pieces.regions import SATURATION_NM
 from iscat_analysis.pipeline import analyse, before_after
 from iscat_analysis.records import Analysis
 from iscat_analysis.search.templates import ExcessNoise
-from iscat_analysis.tracking import block_store
+from iscat_analysis.tracking import blocks as block_store
 
 GAIN, TOO_LARGE = 20.0, 1.6
 SHAPE, FRAMES, LEVEL_E = (40, 44), 26, 2e5

@@ -25,7 +25,7 @@ from iscat_analysis.pipeline import analyse
 from iscat_analysis.pipeline.kinds import kind_of
 from iscat_analysis.records import EVENT_COLUMNS, SEVERITY, Analysis, Status, Windows
 from iscat_analysis.study import Movie
-from iscat_analysis.tracking.moving_field import initial_background, load_field, tracking_context
+from iscat_analysis.tracking.frames import initial_background, load_field, tracking_context
 
 SIDE = 48
 PLACES = ((14.3, 15.7), (33.2, 31.6))

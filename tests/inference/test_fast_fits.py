@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from scenes import PIXEL_NM, gold, make_config
 
-from iscat_analysis._kernels.curvature import first_order_bias
-from iscat_analysis._kernels.hessian import PAIRS
+from iscat_analysis._kernels.hessian import PAIRS, first_order_bias
 from iscat_analysis._kernels.image import signal_gradient, signal_image
 from iscat_analysis._kernels.scoring import image_score, image_value, picture_at, score_pass
 from iscat_analysis.config import Calibration

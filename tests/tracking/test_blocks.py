@@ -17,8 +17,8 @@ from scipy.ndimage import gaussian_filter
 from wanderers import Wanderers, wander
 
 import iscat_analysis.pipeline.finish as finish_module
-import iscat_analysis.tracking.blocks as blocks_module
 import iscat_analysis.tracking.find as tracking_module
+import iscat_analysis.tracking.frames as blocks_module
 from iscat_analysis import pipeline
 from iscat_analysis.calibration import with_standards
 from iscat_analysis.camera import Camera
@@ -28,21 +28,21 @@ from iscat_analysis.fitting.run import RESUMPTION_HINT, partial_folder
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.threads import threads
-from iscat_analysis.tracking.block_store import Block
-from iscat_analysis.tracking.blocks import (
+from iscat_analysis.tracking.blocks import Block, combine_masses, join_tracks
+from iscat_analysis.tracking.frames import (
     MOST_DRIFT_OVER_COUNTING,
     SHORTEST,
     Plan,
     drift_over_counting,
     follow_light,
+    load_field,
     plan_blocks,
+    tracking_context,
 )
-from iscat_analysis.tracking.joining import combine_masses, join_tracks
-from iscat_analysis.tracking.joint.localizations import Localizations
 from iscat_analysis.tracking.linking import has_other_mass
-from iscat_analysis.tracking.moving import find_rows_and_background
-from iscat_analysis.tracking.moving_field import load_field, tracking_context
-from iscat_analysis.tracking.moving_table import common_masses, moving_table, table_of_tracks
+from iscat_analysis.tracking.rows import Localizations
+from iscat_analysis.tracking.stages import find_rows_and_background
+from iscat_analysis.tracking.table import common_masses, moving_table, table_of_tracks
 
 pytestmark = pytest.mark.usefixtures("sketched")
 
@@ -125,7 +125,7 @@ def test_a_block_ends_where_drift_costs_more_than_counting() -> None:
     assert plan.drift_over_counting == pytest.approx(share, rel=0.15)
     assert [a for a, _ in plan.spans[1:]] == [b for _, b in plan.spans[:-1]]
     assert (plan.spans[0][0], plan.spans[-1][1]) == (0, frames)
-    assert f"{len(plan.spans)} blocks of {plan.frames} frames" in plan.message("movie")
+    assert f"{len(plan.spans)} blocks of {plan.frames} frames" in plan.finding("movie").text
 
 
 def test_a_pattern_that_stands_still_is_one_block() -> None:
@@ -133,7 +133,7 @@ def test_a_pattern_that_stands_still_is_one_block() -> None:
     assert plan.spans == ((0, 300),)
     assert plan.drift_over_counting is not None
     assert plan.drift_over_counting < 0.2
-    assert plan.message("movie") == ""
+    assert plan.finding("movie") is None
 
 
 def test_particles_are_no_drift(wanderers: Wanderers) -> None:
@@ -145,7 +145,7 @@ def test_fast_drift_ends_at_the_shortest_block_and_is_said() -> None:
     assert plan.frames == SHORTEST
     assert plan.drift_over_counting is not None
     assert plan.drift_over_counting > 5
-    assert "still change by" in plan.message("movie")
+    assert "still change by" in plan.finding("movie").text
 
 
 def test_cost_of_drift_is_that_of_single_pixels() -> None:

@@ -12,14 +12,17 @@ import pytest
 from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.tracking.extension import extended
-from iscat_analysis.tracking.joint import common
-from iscat_analysis.tracking.joint.common import common_amplitudes, shared_errors, variances_left
-from iscat_analysis.tracking.joint.exposures import Exposures
-from iscat_analysis.tracking.joint.joint_fit import fit_jointly
-from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Judged, Localizations
-from iscat_analysis.tracking.joint.track_coupling import Coupling
+from iscat_analysis.tracking import joint as common
+from iscat_analysis.tracking.field import Exposures, MovingField
+from iscat_analysis.tracking.joint import (
+    Coupling,
+    common_amplitudes,
+    fit_jointly,
+    shared_errors,
+    variances_left,
+)
+from iscat_analysis.tracking.linking import extended
+from iscat_analysis.tracking.rows import BackgroundEstimate, Judged, Localizations
 
 SHAPE, FRAMES, LEVEL_E, ROI, MASS = (30, 30), 40, 4e5, 20, 400.0
 TRIALS, SIGMAS = 40, 4.0

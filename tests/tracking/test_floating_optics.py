@@ -9,7 +9,7 @@ from floaters import Floaters, Sphere, Volume
 from instruments import Instrument
 
 import iscat_analysis as ia
-from iscat_analysis.tracking.tracked_optics import REJECTED_SHARE
+from iscat_analysis.tracking.optics import REJECTED_SHARE
 
 pytestmark = pytest.mark.usefixtures("sketched")
 

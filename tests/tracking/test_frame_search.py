@@ -8,8 +8,8 @@ from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.config import Config
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.tracking.frame_search import FrameCandidates, FrameFilter
-from iscat_analysis.tracking.moving_field import tracking_context
+from iscat_analysis.tracking.frames import tracking_context
+from iscat_analysis.tracking.search import FrameCandidates, FrameFilter
 
 SIDE, ROI, LEVEL_E = 96, 32, 4e5
 

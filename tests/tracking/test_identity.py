@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from iscat_analysis.config import Config, load_config
-from iscat_analysis.tracking.identity import identified
-from iscat_analysis.tracking.joint.localizations import Localizations
-from iscat_analysis.tracking.linking import bridge, meeting
+from iscat_analysis.tracking.linking import bridge, identified, meeting
+from iscat_analysis.tracking.rows import Localizations
 
 FRAMES, MEET, AROUND = 200, 100, 25
 NEAR_NM, ERROR = 370.0, 1.0

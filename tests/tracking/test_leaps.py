@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from iscat_analysis.tracking.joint.localizations import Localizations
-from iscat_analysis.tracking.moving import without_outliers
+from iscat_analysis.tracking.rows import Localizations
+from iscat_analysis.tracking.stages import without_outliers
 
 FRAMES = 200
 

@@ -18,7 +18,7 @@ from scenes import PIXEL_NM, make_config
 
 from iscat_analysis._kernels.background_response import Slopes, keep_slopes
 from iscat_analysis._kernels.canvas import Light
-from iscat_analysis._kernels.curvature import first_order_bias
+from iscat_analysis._kernels.hessian import first_order_bias
 from iscat_analysis._kernels.stamp import add_stamp
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
@@ -28,17 +28,13 @@ from iscat_analysis.optics.model import blurred, path_variance_nm2
 from iscat_analysis.optics.stamp import BAND, RINGS, sample_picture
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.species import fit_diffusion
-from iscat_analysis.tracking.extension import extended
-from iscat_analysis.tracking.frame_search import gaps, link
-from iscat_analysis.tracking.joint import frame_fits
-from iscat_analysis.tracking.joint import joint_fit as settling
-from iscat_analysis.tracking.joint.ascent import ascend, log_likelihood
-from iscat_analysis.tracking.joint.exposures import Exposures
-from iscat_analysis.tracking.joint.joint_fit import first_background, fit_jointly
-from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
-from iscat_analysis.tracking.joint.newton import Response
-from iscat_analysis.tracking.moving import diffusion_of
+from iscat_analysis.tracking import field as frame_fits
+from iscat_analysis.tracking import joint as settling
+from iscat_analysis.tracking.field import Exposures, MovingField
+from iscat_analysis.tracking.joint import ascend, first_background, fit_jointly, log_likelihood
+from iscat_analysis.tracking.linking import extended, gaps, link
+from iscat_analysis.tracking.rows import BackgroundEstimate, Localizations, Response
+from iscat_analysis.tracking.stages import diffusion_of
 
 SHAPE, FRAMES, LEVEL_E, ROI = (40, 44), 60, 4e5, 24
 MASSES = (200.0, 400.0)

@@ -9,8 +9,8 @@ from scenes import PIXEL_NM, make_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.model import blurred
-from iscat_analysis.tracking.frame_search import link
-from iscat_analysis.tracking.paths import SKEW, SKEW_ACROSS, path_covariance
+from iscat_analysis.tracking.linking import link
+from iscat_analysis.tracking.table import SKEW, SKEW_ACROSS, path_covariance
 
 ROI, VARIANCE_NM2, PATHS, PARTS = 24, 120.0, 400, 48
 SIGMAS = 4.0

@@ -12,8 +12,8 @@ from wanderers import FRAME_RATE_HZ, SETTINGS, wander
 
 import iscat_analysis as ia
 from iscat_analysis.camera import Camera
-from iscat_analysis.tracking.common_motion import warnings_of
-from iscat_analysis.tracking.frame_subset import keep_frames
+from iscat_analysis.tracking.frames import keep_frames
+from iscat_analysis.tracking.tracks import common_motion
 
 FRAMES, TRACKS = 300, 8
 STEP_NM = np.where(np.arange(TRACKS) % 2, 30.0, 70.0)
@@ -36,7 +36,7 @@ def _table(walk: Walk) -> pd.DataFrame:
 
 
 def _said(walk: Walk) -> list[str]:
-    return list(warnings_of(_table(walk), FRAME_RATE_HZ))
+    return [found.text for found in common_motion(_table(walk), FRAME_RATE_HZ)]
 
 
 def _vibrating(walk: Walk) -> Walk:
@@ -83,12 +83,12 @@ def test_parts_of_something_else_are_no_particles(status: str) -> None:
     walk[150:, :3] += 600.0
     table = _table(walk)
     table.loc[table["track"] < 3, "status"] = status
-    assert bool(list(warnings_of(table, FRAME_RATE_HZ))) == (status == "ok")
+    assert bool(common_motion(table, FRAME_RATE_HZ)) == (status == "ok")
 
 
 def test_two_particles_are_too_few_to_tell() -> None:
     table = _table(_vibrating(_walk(1)))
-    assert not list(warnings_of(table[table["track"] < 2], FRAME_RATE_HZ))
+    assert not common_motion(table[table["track"] < 2], FRAME_RATE_HZ)
 
 
 @pytest.mark.usefixtures("sketched")
@@ -147,7 +147,7 @@ def test_a_movie_without_odd_frames_is_itself() -> None:
     with open_stack(counts) as movie:
         kept = keep_frames(movie, Camera(), (0, 30))
         assert kept.movie is movie
-        assert not kept.message
+        assert kept.finding is None
 
 
 def test_particles_keep_what_is_divided_out_with_rows_that_flicker(
@@ -167,12 +167,12 @@ def test_particles_keep_what_is_divided_out_with_rows_that_flicker(
 
     wanted, error = mass(steady)
     assert abs(mass(flickering)[0] - wanted) < 0.5 * error  # of the same noise
-    monkeypatch.setattr("iscat_analysis.tracking.moving.restore_particle_light", lambda *_: None)
+    monkeypatch.setattr("iscat_analysis.tracking.stages.restore_particle_light", lambda *_: None)
     assert wanted - mass(flickering)[0] > 4 * error  # control
 
 
 def test_steps_over_frames_that_are_known_to_be_missing_are_no_surprise() -> None:
     kept = np.delete(np.arange(FRAMES), np.random.default_rng(3).choice(FRAMES, 35, replace=False))
     table = _table(_walk(1)[kept])
-    assert list(warnings_of(table, FRAME_RATE_HZ))
-    assert not list(warnings_of(table, FRAME_RATE_HZ, kept))
+    assert common_motion(table, FRAME_RATE_HZ)
+    assert not common_motion(table, FRAME_RATE_HZ, kept)

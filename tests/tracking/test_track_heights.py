@@ -10,11 +10,10 @@ import pytest
 from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.tracking.heights import decide_heights
-from iscat_analysis.tracking.joint.exposures import Exposures
-from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
-from iscat_analysis.tracking.moving_table import collected_areas, quantum_bounds
+from iscat_analysis.tracking.field import Exposures, MovingField
+from iscat_analysis.tracking.rows import BackgroundEstimate, Localizations
+from iscat_analysis.tracking.stages import decide_heights
+from iscat_analysis.tracking.table import collected_areas, quantum_bounds
 
 SHAPE, FRAMES, LEVEL_E, ROI = (28, 28), 40, 4e5, 24
 

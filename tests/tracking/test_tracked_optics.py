@@ -16,13 +16,14 @@ from wanderers import SETTINGS, Wanderers, wander
 import iscat_analysis as ia
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.findings import Findings
 from iscat_analysis.instrument import loop
 from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.joint_fit import excess
 from iscat_analysis.instrument.loop import Round, Rounds
 from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.optics.parameters import settings_of, with_settings
-from iscat_analysis.tracking.tracked_optics import (
+from iscat_analysis.tracking.optics import (
     MASS_SHARE,
     REJECTED_SHARE,
     Misfit,
@@ -205,7 +206,8 @@ def test_rounds_end_where_the_first_four_describe_nothing(
 ) -> None:
     """Tracks followed with optics of every round are described from one of them on, or never."""
     seen: list[float] = []
-    told: list[str] = []
+    told = Findings()
+    run = SimpleNamespace(report=told.add, warn=None, notify=lambda _: None)
 
     def begin(config: Config, **_: bool) -> Any:
         described = described_from is not None and len(seen) % rounds >= described_from
@@ -225,7 +227,7 @@ def test_rounds_end_where_the_first_four_describe_nothing(
     monkeypatch.setattr(loop, "fit_optics", fit)
     with ThreadPoolExecutor(1) as pool:
         config = Config.model_validate({"optics": {"calibrate": "auto"}})
-        _, summary = learn_from_tracks(config, begin, name="m", pool=pool, warn=told.append)
+        _, summary = learn_from_tracks(config, begin, name="m", pool=pool, run=run)
     assert len(seen) == 2 * rounds  # of all particles, and of those that stand alone
     assert not summary["calibrated"]
-    assert "other optics were not learned: not yet" in told[0]
+    assert "other optics were not learned: not yet" in told.warnings[0]

@@ -383,7 +383,7 @@ def _timed(**camera: float) -> list[str]:
         {"camera": {"pixel_size_nm": PIXEL_NM, **camera}, "fit": {"mode": "track"},
          "background": {"frames": [0, 10]}}
     )  # fmt: skip
-    return list(judge_times(config, 100, "movie.tif"))
+    return [found.text for found in judge_times(config, 100, "movie.tif")]
 
 
 def test_an_exposure_longer_than_the_interval_is_refused() -> None:
@@ -410,11 +410,13 @@ def test_a_short_movie_is_said_with_what_it_can_tell() -> None:
     config = parse_config({"camera": {"pixel_size_nm": 84.0, "frame_rate_hz": 331.0,
                                       "exposure_ms": 2.0}, "fit": {"mode": "track"},
                            "background": {"frames": [0, 10]}})  # fmt: skip
-    assert not list(judge_times(config, SHORT_MOVIE, "movie.tif"))
-    (line,) = judge_times(config, 10, "movie.tif")
-    assert line.startswith("movie.tif: 10 frames tell no diffusion coefficient better than to 33 %")
-    (line,) = judge_times(config, 5, "movie.tif")
-    assert "track.min_frames = 10" in line
+    assert not judge_times(config, SHORT_MOVIE, "movie.tif")
+    (found,) = judge_times(config, 10, "movie.tif")
+    assert found.text.startswith(
+        "movie.tif: 10 frames tell no diffusion coefficient better than to 33 %"
+    )
+    (found,) = judge_times(config, 5, "movie.tif")
+    assert "track.min_frames = 10" in found.text
 
 
 def test_tracks_longer_than_the_movie_are_not_looked_for() -> None:
@@ -423,18 +425,19 @@ def test_tracks_longer_than_the_movie_are_not_looked_for() -> None:
                                       "exposure_ms": 2.0}, "fit": {"mode": "track"},
                            "background": {"method": "tracks"},
                            "track": {"min_frames": 60}})  # fmt: skip
-    assert not list(judge_times(config, 60, "movie.tif"))
+    assert not judge_times(config, 60, "movie.tif")
     with pytest.raises(ConfigError, match=r"track\.min_frames = 60 is more than the 59 frames of"):
-        list(judge_times(config, 59, "movie.tif"))
+        judge_times(config, 59, "movie.tif")
 
 
 def test_steps_that_are_not_linked_are_told() -> None:
     """Of steps of 181 nm along each axis 0.4 % exceed 600 nm, and with them 2.2 % of D is lost."""
     told = pd.DataFrame({"status": ["ok"], "d_um2_s": [16.36]})
-    text = cut_steps(told, setup(frame_rate_hz=1000.0), 600.0)
-    assert "0.41 % of steps are longer than track.max_step_nm = 600" in text
-    assert "set it to 904" in text
-    assert cut_steps(told, setup(frame_rate_hz=1000.0), 904.0) == ""
+    found = cut_steps(told, setup(frame_rate_hz=1000.0), 600.0)
+    assert found is not None
+    assert "0.41 % of steps are longer than track.max_step_nm = 600" in found.text
+    assert found.remedy == "set it to 904"
+    assert cut_steps(told, setup(frame_rate_hz=1000.0), 904.0) is None
     rng = np.random.default_rng(2)
     steps = rng.normal(0, 180.9, (400_000, 2))
     kept = steps[np.hypot(*steps.T) < 600]

@@ -1,4 +1,4 @@
-"""The maximum of one likelihood for all particles that move over an unknown, constant background.
+"""The likelihood of all particles that move over an unknown, constant background.
 
 The counts n of pixel p in frame t are Poisson with w_t B_p (1 + C_tp), C the sum of the signals of
 all particles.  Given their sum over the frames the counts of a pixel are multinomial with
@@ -11,6 +11,9 @@ put in (envelope theorem), so that fitting the particles over B̂ and B̂ under 
 ends at its maximum, and nothing is left of the particles in their background.  Turns alone converge
 as slowly as the particles move.  How the rows follow a change of the background is known from their
 informations, so that Newton's method sees where the turns would end (`fit_jointly`).
+
+Nearly all rows converge by plain Fisher scoring.  The kernel of the search with a step control is
+compiled only when the first row needs it.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -28,26 +31,238 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.background_response import Slopes
 from iscat_analysis._kernels.canvas import (
     Canvas,
+    Counts,
     Field,
     Light,
     Pictures,
+    Rows,
     add_squares,
+    draw_frames,
     subtract_expected,
 )
-from iscat_analysis._kernels.moving import Search
-from iscat_analysis._kernels.scoring import CONVERGED
+from iscat_analysis._kernels.lens import LatticeLens, RoundLens, StampLens
+from iscat_analysis._kernels.moving import Fits, Room, Search, fit_frames
+from iscat_analysis._kernels.radial import POWERS
+from iscat_analysis._kernels.scoring import CONVERGED, maximize
 from iscat_analysis._kernels.track_precision import judge_frames
 from iscat_analysis.inference.fit import window_nm
+from iscat_analysis.inference.laws import POISSON
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
+from iscat_analysis.optics.model import blurred, spreads
+from iscat_analysis.optics.stamp import BAND, RINGS, sample_picture, weights_between
+from iscat_analysis.optics.waves import axial_table
 from iscat_analysis.records import BoolArray, FloatArray
-from iscat_analysis.tracking.joint.exposures import Exposures
-from iscat_analysis.tracking.joint.frame_fits import draw_rows, fit_rows, room_for
-from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Judged, Localizations
-from iscat_analysis.tracking.joint.newton import Response
-from iscat_analysis.tracking.joint.pictures import PictureBook
-from iscat_analysis.tracking.joint.render_plan import RenderPlan, blank
+from iscat_analysis.tracking.rows import BackgroundEstimate, Judged, Localizations, Response
 
 IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Exposures:
+    """Counts, and what they stand for."""
+
+    counts: Counts
+    gain: float = 1.0
+    offset: float = 0.0
+
+    def electrons(self, *where: slice | int) -> NDArray[np.float32]:
+        """Give the photoelectrons of some frames."""
+        out = np.asarray(np.subtract(self.counts[where], self.offset, dtype=np.float32))
+        out *= np.float32(self.gain)
+        return out
+
+    def in_electrons(self, sums: Any, of: int) -> FloatArray:
+        """Convert sums of counts."""
+        return np.asarray(self.gain * (sums - of * self.offset))
+
+
+class PictureBook:
+    """Makes pictures of particles with any blur."""
+
+    def __init__(
+        self,
+        near: ForwardModel,
+        far: ForwardModel,
+        *,
+        pixel_nm: float,
+        near_px: float,
+        far_px: float,
+        z_range_nm: tuple[float, float] | None,
+    ) -> None:
+        self._near, self._far = near, far
+        self._pixel_nm, self._z_range = pixel_nm, z_range_nm
+        self._near_px, self._far_px = near_px, far_px
+
+    def of(self, variances_nm2: FloatArray) -> tuple[Pictures, Pictures]:
+        """Make the pictures of some blurs.
+
+        Shapes: `variances_nm2` (groups,).
+        """
+        if self._z_range is not None:
+            return (
+                _along_z(self._near, variances_nm2, self._z_range),
+                _along_z(self._far, variances_nm2, self._z_range),
+            )
+        return (
+            _blurred(self._sharp_near, variances_nm2, BAND),
+            _blurred(self._sharp_far, variances_nm2, RINGS),
+        )
+
+    @cached_property
+    def _sharp_near(self) -> Pictures:
+        return _at_one_height(self._far, self._pixel_nm, self._near_px, BAND)
+
+    @cached_property
+    def _sharp_far(self) -> Pictures:
+        return _at_one_height(self._far, self._pixel_nm, self._far_px, RINGS)
+
+
+def _at_one_height(model: ForwardModel, pixel_nm: float, half_px: float, band: float) -> Pictures:
+    """Sharp picture at the model's height."""
+    lens, samples = sample_picture(model, pixel_nm, half_px, band)
+    return Pictures(
+        samples.reshape(1, 1, 1, 2, -1), 0.0, 1.0, 0.0, lens, lens.window[None],
+        samples.astype(np.float32),
+    )  # fmt: skip
+
+
+def _blurred(sharp: Pictures, variances_nm2: FloatArray, band: float) -> Pictures:
+    """Give a picture at one height the weights of every blur."""
+    inverse = sharp.lens.inv_step
+    windows = [
+        sum(
+            share * weights_between(v * inverse**2, band)
+            for share, v in spreads(float(q), each_axis=True)
+        )
+        for q in variances_nm2
+    ]
+    return sharp._replace(windows=np.stack(windows))
+
+
+def _along_z(
+    model: ForwardModel, variances_nm2: FloatArray, z_range_nm: tuple[float, float]
+) -> Pictures:
+    """Tables of a model for every blur, along z."""
+    tables = [
+        axial_table(blurred(model, float(q), upwards=True).wave, z_range_nm) for q in variances_nm2
+    ]
+    heights = np.stack([table.heights for table in tables])
+    one, lens = tables[0], model.lens
+    window = np.zeros((1, 0, 0)) if isinstance(lens, RoundLens) else lens.window[None]
+    return Pictures(
+        heights, one.first_nm, one.step_nm, one.kappa, lens, window, np.zeros((2, 0, 0))
+    )
+
+
+@dataclass(frozen=True)
+class RenderPlan:
+    """A canvas and the rows that are on it."""
+
+    rows: Localizations
+    canvas: Canvas
+    coarse: bool
+
+    def moved(self, rows: Localizations, frames: int) -> Canvas:
+        """Set other rows; frames in which rows changed are marked."""
+        old, canvas = self.rows, self.canvas
+        here, there = rows.starts(frames), old.starts(frames)
+        same = np.diff(here) == np.diff(there)
+        mine = np.flatnonzero(np.repeat(same, np.diff(here)))
+        theirs = np.flatnonzero(np.repeat(same, np.diff(there)))
+        other = (rows.group[mine] != old.group[theirs]) | (rows.track[mine] != old.track[theirs])
+        same[rows.frame[mine[other]]] = False
+        rings, squares = np.zeros((2, *rows.theta.shape))
+        rings[mine], squares[mine] = canvas.rings[theirs], canvas.squares[theirs]
+        return Canvas(canvas.total, rings, squares, canvas.drawn & same)
+
+
+def blank(room: NDArray[np.float32], rows: Localizations) -> Canvas:
+    """Make an empty canvas.
+
+    Shapes: `room` (t, y, x).
+    """
+    nothing = np.zeros(len(room), dtype=bool)
+    return Canvas(room, np.zeros_like(rows.theta), np.zeros_like(rows.theta), nothing)
+
+
+def room_for(field: Field, near: Pictures, free: BoolArray) -> Room:
+    """Allocate the scratch memory of the kernels that fit rows.
+
+    Shapes: `free` (5,).
+    """
+    index, area = np.flatnonzero(free[:4]), field.side**2
+    return Room(
+        np.empty(15 * area, near.nodes.dtype), np.empty(area, np.float32), _profile(near, 2), index,
+        np.empty((11, 5)), np.empty((4, index.size)),
+        np.empty(0 if isinstance(near.lens, StampLens) else 10 * area),
+    )  # fmt: skip
+
+
+def _profile(pictures: Pictures, orders: int) -> FloatArray:
+    """Make room for a profile, as `iscat_analysis._kernels.scoring.blank_profile` does."""
+    lens, (channels, width) = pictures.lens, pictures.heights.shape[3:]
+    if isinstance(lens, StampLens):
+        return np.empty((0, 0, 0))
+    if isinstance(lens, LatticeLens):
+        return np.empty((orders * channels, 2 * lens.half + 1, 2 * lens.half + 1))
+    return np.empty((width // POWERS, POWERS, orders * channels))
+
+
+def draw_rows(
+    field: Field, near: Pictures, far: Pictures, rows: Rows, first: int, last: int, canvas: Canvas
+) -> None:
+    """Update frames first…last − 1 of the canvas to the current rows."""
+    draw_frames(
+        field, near, far, rows, first, last, canvas, _profile(near, 1), _profile(far, 1),
+        np.empty(max(field.drawn, field.side) ** 2),
+    )  # fmt: skip
+
+
+def fit_rows(
+    light: Light, field: Field, near: Pictures, search: Search, rows: Rows, first: int, last: int,
+    sweeps: int, canvas: Canvas, slopes: Slopes, fits: Fits, expected: FloatArray,
+    sums: NDArray[np.float32],
+) -> None:  # fmt: skip
+    """Fit the rows of frames first…last − 1, each `sweeps` times."""
+    place = np.array([first, 0, rows.starts[first], 0, 0, 0, 0])
+    room = room_for(field, near, search.free)
+    background = light.background.astype(np.float32)
+    while not fit_frames(
+        light, field, near, search, rows, last, sweeps, canvas, slopes, fits, expected, background,
+        sums, place, room,
+    ):  # fmt: skip
+        row = int(place[2])
+        fits.gain[row], fits.outcome[row] = fit_with_search(
+            field, near, search, place, room, int(rows.group[row]), rows.theta[row]
+        )
+
+
+def fit_with_search(
+    field: Field, near: Pictures, search: Search, place: IntArray, room: Room, group: int,
+    theta: FloatArray,
+) -> tuple[float, int]:  # fmt: skip
+    """Fit a row whose plain steps diverge; θ is overwritten with the estimate.
+
+    Returns its log-likelihood over that without the particle, and how the fit ended.
+    """
+    top, bottom, left, right = place[3:]
+    shape = 4, bottom - top, right - left
+    start = room.small[10]
+    data = room.pixels[: math.prod(shape)].reshape(shape).astype(np.float64)
+    heights = near.heights[min(group, len(near.heights) - 1)]
+    table = heights, near.first_nm, near.step_nm, near.kappa
+    lens = near.lens
+    if not isinstance(lens, RoundLens):
+        lens = lens._replace(window=near.windows[min(group, len(near.windows) - 1)])
+    x, y, offsets, weights = field.pixels
+    value, _, outcome = maximize(
+        table, tuple(lens), (x[left:right], y[top:bottom], offsets, weights), POISSON.code, data,
+        search.free, np.maximum(search.lower, start - search.reach),
+        np.minimum(search.upper, start + search.reach), search.max_step, search.tolerance,
+        search.passes, theta, np.empty((5, 5)), -math.inf, (0.0, 0.0),
+    )  # fmt: skip
+    return value, outcome
+
 
 DRAWN = 4
 """Side of the square in which a particle is drawn, over that in which it is fitted."""
@@ -207,33 +422,32 @@ class MovingField:
         """
         light = self._light(ground)
         near, far = self._pictures_for(coarse=coarse)
-        theta = rows.theta.copy()
-        starts = rows.starts(self.frames)
-        outcome = np.full(len(theta), CONVERGED, dtype=np.int64)
-        fisher, gain = np.zeros((len(theta), 4, 4)), np.empty(len(theta))
+        theta, n = rows.theta.copy(), len(rows.frame)
+        particles = Rows(rows.starts(self.frames), theta, rows.group)
+        fits = Fits(np.full(n, CONVERGED, np.int64), np.zeros((n, 4, 4)), np.empty(n))
         canvas = self._canvas_for(rows, coarse=coarse)
         field = self._coarse if coarse else self._whole
         search = self._search if sweeps > 1 else self._search._replace(tolerance=_ROUGH_TOLERANCE)
-        slopes = self._slopes_of(len(theta), field.side if sweeps else 0)
+        slopes = self._slopes_of(n, field.side if sweeps else 0)
         expected = np.zeros(self.frames)
 
         def block(first: int) -> NDArray[np.float32]:
             sums = np.zeros(self.used.shape, dtype=np.float32)
             last = min(first + BLOCK, self.frames)
-            draw_rows(field, near, far, starts, first, last, theta, rows.group, canvas)
+            draw_rows(field, near, far, particles, first, last, canvas)
             fit_rows(
-                light, field, near, search, starts, first, last, sweeps, theta, rows.group, canvas,
-                slopes, outcome, fisher, gain, expected, sums,
+                light, field, near, search, particles, first, last, sweeps, canvas, slopes, fits,
+                expected, sums,
             )  # fmt: skip
             return sums
 
         stretch = ground.power.sum() + self.sum_of(block)
-        fitted = rows.fitted(theta, fisher, gain) if sweeps else rows
+        fitted = rows.fitted(theta, fits.information, fits.gain) if sweeps else rows
         self._canvas = RenderPlan(fitted, canvas, coarse)
         if sweeps:
-            own = np.ascontiguousarray(fisher[:, self.free[:4]][:, :, self.free[:4]])
+            own = np.ascontiguousarray(fits.information[:, self.free[:4]][:, :, self.free[:4]])
             self._response = Response(
-                slopes, starts, light, canvas.total, own, self._pool, joint=not coarse
+                slopes, particles.starts, light, canvas.total, own, self._pool, joint=not coarse
             )
         if sweeps and not coarse:  # among rows that are only tried some would be pushed away
             walls = search.lower, search.upper
@@ -245,7 +459,7 @@ class MovingField:
         return (
             fitted,
             BackgroundEstimate(np.maximum(level, 1e-3), power / power.mean()),
-            outcome == CONVERGED,
+            fits.outcome == CONVERGED,
         )
 
     def where_turns_end(self, move: FloatArray, damping: float) -> FloatArray:
@@ -318,9 +532,8 @@ class MovingField:
         canvas = blank(np.empty((last - first, *self.used.shape), dtype=np.float32), within)
         near, far = self._pictures_for(coarse=True)
         starts = np.searchsorted(within.frame, np.arange(first, last + 1)).astype(np.int64)
-        draw_rows(
-            self._coarse, near, far, starts, 0, last - first, within.theta, within.group, canvas
-        )
+        particles = Rows(starts, within.theta, within.group)
+        draw_rows(self._coarse, near, far, particles, 0, last - first, canvas)
         return canvas.total
 
     def judge(self, ground: BackgroundEstimate, rows: Localizations) -> Judged:
@@ -328,7 +541,7 @@ class MovingField:
         n = len(rows.frame)
         light = self._light(ground)
         near, far = self._pictures_for(coarse=False)
-        starts = rows.starts(self.frames)
+        particles = Rows(rows.starts(self.frames), rows.theta, rows.group)
         fisher, (turned, ways) = np.zeros((n, 4, 4)), np.full((2, n, 4, 4), np.nan)
         bias, numbers = np.zeros((n, 4)), np.zeros((n, 6))
         canvas = self._canvas_for(rows, coarse=False)
@@ -336,11 +549,10 @@ class MovingField:
 
         def block(first: int) -> FloatArray:
             last = min(first + BLOCK, self.frames)
-            draw_rows(self._whole, near, far, starts, first, last, rows.theta, rows.group, canvas)
+            draw_rows(self._whole, near, far, particles, first, last, canvas)
             judge_frames(
-                light, self._whole, near, self.free, starts, first, last, rows.theta, rows.group,
-                canvas, slopes, fisher, turned, ways, bias, numbers,
-                room_for(self._whole, near, self.free),
+                light, self._whole, near, self.free, particles, first, last, canvas, slopes,
+                fisher, turned, ways, bias, numbers, room_for(self._whole, near, self.free),
             )  # fmt: skip
             return np.zeros(1)
 
@@ -381,23 +593,22 @@ class MovingField:
         times, frame = np.unique(rows.frame, return_inverse=True)
         light = light._replace(counts=light.counts[times], power=light.power[times])
         starts = np.searchsorted(frame, np.arange(times.size + 1)).astype(np.int64)
-        theta, n = rows.theta.copy(), len(frame)
+        n, particles = len(frame), Rows(starts, rows.theta.copy(), rows.group)
         canvas = blank(np.empty(light.counts.shape, dtype=np.float32), rows)
-        outcome = np.zeros(n, dtype=np.int64)
-        fisher, gain = np.zeros((n, 4, 4)), np.empty(n)
+        fits = Fits(np.zeros(n, dtype=np.int64), np.zeros((n, 4, 4)), np.empty(n))
         slopes, expected = self._slopes_of(n, 0), np.zeros(times.size)
 
         def block(part: int) -> None:
             first, last = part * _FRAMES_PER_SWEEP, min((part + 1) * _FRAMES_PER_SWEEP, times.size)
-            draw_rows(self._coarse, near, far, starts, first, last, theta, rows.group, canvas)
+            draw_rows(self._coarse, near, far, particles, first, last, canvas)
             fit_rows(
-                light, self._coarse, near, self._search, starts, first, last, sweeps, theta,
-                rows.group, canvas, slopes, outcome, fisher, gain, expected,
-                np.zeros(self.used.shape, dtype=np.float32),
+                light, self._coarse, near, self._search, particles, first, last, sweeps, canvas,
+                slopes, fits, expected, np.zeros(self.used.shape, dtype=np.float32),
             )  # fmt: skip
 
         self.share(block, -(-times.size // _FRAMES_PER_SWEEP))
-        return rows.fitted(theta, fisher, gain), outcome == CONVERGED
+        fitted = rows.fitted(particles.theta, fits.information, fits.gain)
+        return fitted, fits.outcome == CONVERGED
 
     def on_wall(self, rows: Localizations) -> BoolArray:
         """Tell which rows ended at a limit of the search.

@@ -1,6 +1,6 @@
 """The optics of a movie in which particles move, tested on its tracks and learned from them.
 
-The pictures of `iscat_analysis.tracking.aligned` show what the model leaves over of all frames.  A
+The pictures of `iscat_analysis.tracking.blocks` show what the model leaves over of all frames.  A
 good model leaves over noise, and less than a hundredth of the particle where there is little of it;
 an NA of 1.40 for 1.42, a focus wrong by 20 nm or 15 nm of coma leave over a tenth.
 """
@@ -8,7 +8,7 @@ an NA of 1.40 for 1.42, a focus wrong by 20 nm or 15 nm of coma leave over a ten
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,8 +18,9 @@ import numpy as np
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.findings.tracks import TRACKS_HALF_DESCRIBED, TRACKS_NOT_DESCRIBED
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.run import notify_nobody
+from iscat_analysis.fitting.run import Run
 from iscat_analysis.inference.cause import PIXEL, Cause, likely_cause
 from iscat_analysis.inference.fit import goodness_of_fit
 from iscat_analysis.instrument.fit_optics import Collected
@@ -28,8 +29,7 @@ from iscat_analysis.instrument.loop import Rounds, learn
 from iscat_analysis.instrument.microscope import REJECTED_P
 from iscat_analysis.optics.parameters import FREE, MOST_IMAGES, Settings, heights_free, settings_of
 from iscat_analysis.records import BoolArray
-from iscat_analysis.tracking.aligned import Aligned
-from iscat_analysis.tracking.block_store import Block
+from iscat_analysis.tracking.blocks import Aligned, Block
 from iscat_analysis.trust.systematic import MASS_SHARE, REJECTED_SHARE
 from iscat_analysis.units import count
 
@@ -99,13 +99,7 @@ class TrackFirstFrames(Protocol):
 
 
 def learn_from_tracks(
-    config: Config,
-    begin: TrackFirstFrames,
-    *,
-    name: str,
-    pool: ThreadPoolExecutor,
-    warn: Callable[[str], None],
-    notify: Callable[[str], None] = notify_nobody,
+    config: Config, begin: TrackFirstFrames, *, name: str, pool: ThreadPoolExecutor, run: Run
 ) -> tuple[TrialTracks, dict[str, Any]]:
     """Track the first frames, test the optics on them, and learn better ones where they fail.
 
@@ -134,7 +128,7 @@ def learn_from_tracks(
             raise trouble
         if trouble is not None:
             raise DataError(f"{message}; nothing can be followed with them: {trouble}") from trouble
-        warn(message)
+        run.report(TRACKS_NOT_DESCRIBED({"why": message}))
         return begun, tested | {"calibrated": False, "reason": reason}
 
     learns = optics.calibrate == "always" or (optics.calibrate == "auto" and optics.file is None)
@@ -142,7 +136,7 @@ def learn_from_tracks(
         message = _message(left, cause, learns=learns)
         return as_configured(message, message)
     reason = ""
-    notify("learning the optics from the tracks of the movie, which may take minutes…")
+    run.notify("learning the optics from the tracks of the movie, which may take minutes…")
     start = _start(config, cause)
     # with free heights rings are taken for many particles, each with its own: that takes long
     apart = trouble is not None or heights_free(config)
@@ -154,13 +148,13 @@ def learn_from_tracks(
             if rounds.best is not None:
                 found = rounds.best.found.less_sure(rounds.error_of(rounds.best))
                 learned, told = adopted(
-                    found, config, tested, left.verdict, picture_of="track picture", warn=warn
+                    found, config, tested, left.verdict, picture_of="track picture", warn=run.warn
                 )
                 return begin(learned), told
             why = next((one.reason for one in reversed(rounds.all) if one.reason), _NO_BETTER)
             last = tracks.begun
             if trouble is not None and last.left is not None and tracks.described:
-                warn(f"{left.verdict}; others are used that describe them better, but: {why}")
+                run.report(TRACKS_HALF_DESCRIBED({"verdict": left.verdict, "why": why}))
                 told = {"calibrated": True, "reason": why, "left_over_then": last.left.share}
                 return last, tested | told
         except (DataError, ConfigError) as error:  # or what was learned asks for too much memory

@@ -1,4 +1,11 @@
-"""What the frames of one track have in common: one mass, and the errors of its background.
+"""The maximum of the likelihood of `MovingField`, and what the frames of one track have in common.
+
+Of a particle that hardly moves the background takes all but its displacements times its mass, and
+how large these are for themselves is told by what is of second order in them.  Newton's step along
+that direction is the quotient of two small numbers, of which the lower one, 1 − E, is known no
+better than the expected information is the observed one: some steps are twenty times too long, or
+lead the other way.  So `ascend` takes a step back where the likelihood falls, and damps the next
+(Levenberg 1944, Marquardt 1963).  A turn without Newton's step always climbs.
 
 The information on all parameters of a track over an unknown background is, per pixel,
 
@@ -25,17 +32,216 @@ is solved by conjugate gradients.  Tracks are taken one by one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.background_response import Slopes, follow, own_shares, send
+from iscat_analysis.medians import middle
 from iscat_analysis.records import BoolArray, FloatArray
-from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Judged, Localizations
-from iscat_analysis.tracking.joint.track_coupling import Coupling
+from iscat_analysis.tracking.field import BLOCK, MovingField
+from iscat_analysis.tracking.rows import BackgroundEstimate, Judged, Localizations
 
 IntArray = NDArray[np.int64]
+
+MOST_TURNS = 12
+"""Steps at most."""
+
+MOST_STEP_RATIO = 5.0
+"""Newton's step over the move of one turn, from which it is not trusted."""
+
+_SETTLED = 0.1  # step of the background, in its own standard deviations, that is the last one
+_NEXT_STEP_SETTLED = 0.02  # the same, of the next step if it shrinks as the last one did
+_ROUGH_STEP = 2.0  # step that is the last one while particles are still being looked for
+_NEAR_STEP, _FAR_STEP = 0.5, 5.0  # one below the former after one above the latter: new rings
+_MEDIAN_FRAMES = 400  # that suffice: particles are found over it, and fitted over a better one
+_DAMPING = 0.01  # of Newton's step, at first and at least: by as much 1 − E is wrong
+_DAMPING_UP, _DAMPING_DOWN = 10.0, 0.25  # by what it changes where the turns grow, or shrink fast
+_POWER_TURNS = 3  # over a background that stays
+_POWER_SETTLED = 1e-7
+_LIKELIHOOD_NOISE = 0.5  # of the log-likelihood, by how the canvas is drawn
+_LEAST_GAIN = 0.05  # expected gain of the step that is the last one
+_MOST_STEPS = 40
+_MOST_SIGNAL = 0.99  # signal of a pixel that is taken to be none of a particle's
+
+
+def ascend(
+    field: MovingField, ground: BackgroundEstimate, rows: Localizations, *, follow_power: bool
+) -> tuple[Localizations, BackgroundEstimate, BoolArray]:
+    """Maximise the likelihood of rows and background by steps that never lower it."""
+    counts = np.where(field.used, np.maximum(field.total_e, 1.0), 0.0)
+    damping, best, kept = _DAMPING, -np.inf, (rows, ground)
+    for _ in range(_MOST_STEPS):
+        rows, found, done = field.fit(ground, rows)
+        found = BackgroundEstimate(found.level, found.power if follow_power else ground.power)
+        move = np.where(field.used, np.log(found.level / ground.level), 0.0)
+        value = log_likelihood(field, found, rows)
+        if value < best - _LIKELIHOOD_NOISE:
+            rows, ground = kept
+            damping *= _DAMPING_UP
+            continue
+        best, kept = max(best, value), (rows, found)
+        damping = max(0.5 * damping, _DAMPING)
+        step, gain = _damped_step(field, move, counts, damping)
+        ground = BackgroundEstimate(found.level * np.exp(step - move), found.power)
+        if gain < _LEAST_GAIN:
+            return field.followed(rows, step), ground, done
+    return *kept, done
+
+
+def _damped_step(
+    field: MovingField, move: FloatArray, counts: FloatArray, damping: float
+) -> tuple[FloatArray, float]:
+    """Damp a Newton step until the likelihood is expected to rise; give the expected gain."""
+    while True:
+        step = field.where_turns_end(move, damping)
+        gain = 0.5 * float(np.sum(counts * move * step))
+        if not gain <= 0 or not move.any():  # one that is no number climbs no better when damped
+            return step, gain
+        damping *= _DAMPING_UP
+
+
+def log_likelihood(field: MovingField, ground: BackgroundEstimate, rows: Localizations) -> float:
+    """Profile log-likelihood of rows: the background maximises it under these rows."""
+    total, power = field.draw(ground, rows, coarse=False), ground.power
+
+    def block(first: int) -> FloatArray:
+        here = slice(first, first + BLOCK)
+        signal = np.maximum(total[here].astype(np.float64), -_MOST_SIGNAL)
+        bright = power[here, None, None] * (1 + signal)
+        seen = np.einsum("tyx,tyx->yx", field.exposures.electrons(here), np.log1p(signal))
+        return np.stack([seen, bright.sum(axis=0)])
+
+    seen, stretch = field.sum_of(block)
+    each = seen - field.total_e * np.log(stretch)
+    return float(each[field.used].sum() + field.frame_totals @ np.log(power))
+
+
+def first_background(field: MovingField, *, follow_power: bool) -> BackgroundEstimate:
+    """Median of frames, each over its power; of a long movie, of some that are spread over it."""
+    power = np.ones(field.frames)
+    if follow_power:
+        power = field.frame_totals / field.frame_totals.mean()
+    some = slice(None, None, max(field.frames // _MEDIAN_FRAMES, 1))
+    scale = (1 / power[some]).astype(np.float32)
+    level = np.empty(field.used.shape)
+
+    def median(row: int) -> None:
+        each = field.exposures.electrons(some, row) * scale[:, None]
+        level[row] = middle(np.ascontiguousarray(each.T))
+
+    field.share(median, len(level))
+    return BackgroundEstimate(np.maximum(level, 1e-3), power)
+
+
+def fit_jointly(
+    field: MovingField,
+    ground: BackgroundEstimate,
+    rows: Localizations,
+    *,
+    follow_power: bool,
+    follow_level: bool = True,
+    turns: int = MOST_TURNS,
+    coarse: bool = False,
+) -> tuple[Localizations, BackgroundEstimate, BoolArray]:
+    """Fit rows and background in turn until neither changes."""
+    sigma = 1 / np.sqrt(np.maximum(field.total_e, 1.0))
+    least = _ROUGH_STEP if coarse else _SETTLED
+    largest, length, change, damping = 0.0, np.inf, 0.0, _DAMPING
+    done, step = np.ones(len(rows.frame), dtype=bool), np.zeros(field.used.shape)
+    for turn in range(turns):
+        rows, found, done = field.fit(ground, rows, coarse=coarse)
+        power = found.power if follow_power else ground.power
+        if not follow_level:
+            steady = bool(np.abs(power - ground.power).max() < _POWER_SETTLED)
+            ground = replace(ground, power=power)
+            if steady or turn + 1 >= _POWER_TURNS:
+                break
+            continue
+        move = np.where(field.used, np.log(found.level / ground.level), 0.0)
+        last, length = length, float(np.linalg.norm(move / sigma))
+        damping *= _DAMPING_UP if length > last else _DAMPING_DOWN if length < last / 2 else 1.0
+        step = field.where_turns_end(move, damping)
+        if not coarse and np.linalg.norm(step / sigma) > MOST_STEP_RATIO * length:
+            return ascend(field, ground, rows, follow_power=follow_power)
+        before, change = change, float(np.abs(step / sigma)[field.used].max(initial=0.0))
+        level = np.where(field.used, ground.level * np.exp(step), found.level)
+        ground = BackgroundEstimate(level, power)
+        largest = max(largest, change)
+        if change < _NEAR_STEP and largest > _FAR_STEP and not coarse:
+            field.draw_anew()
+            largest = change
+        elif change < least or change**2 < _NEXT_STEP_SETTLED * before:
+            break
+    if follow_level:
+        rows = field.followed(rows, step)
+    return rows, ground, done
+
+
+class Coupling:
+    """Some rows and the pixels of their squares."""
+
+    def __init__(
+        self,
+        field: MovingField,
+        ground: BackgroundEstimate,
+        slopes: Slopes,
+        rows: NDArray[np.int64],
+    ) -> None:
+        self._slopes, self._rows = slopes, rows
+        squares = slopes.squares[rows]
+        top, left = squares[:, 0].min(), squares[:, 2].min()
+        bottom, right = squares[:, 1].max(), squares[:, 3].max()
+        self._squares = squares - np.array([top, top, left, left])
+        cut = slice(top, bottom), slice(left, right)
+        level = ground.level[cut]
+        share = np.where(field.used[cut], level / (level + field.read_e2[cut]), 0.0)
+        self._weight = share / np.maximum(field.total_e[cut], 1.0)
+        self._sigma = np.sqrt(self._weight)
+        self._room = slopes.values.shape[2]
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels."""
+        return self._weight.size
+
+    def own(self) -> FloatArray:
+        """Information that each row by itself loses to the background, G N⁻¹ Gᵀ.
+
+        Shapes: result (n, free, free).
+        """
+        free = self._slopes.values.shape[1]
+        out = np.zeros((len(self._rows), free, free))
+        own_shares(
+            self._slopes, self._rows, self._squares, self._weight, out, *np.empty((2, self._room))
+        )
+        return out
+
+    def sent(self, by: FloatArray) -> FloatArray:
+        """Change of the background that changes of rows make, N⁻½ Σ Gᵀ by.
+
+        Shapes: `by` (n, b, free), result (b, pixels).
+        """
+        out = np.zeros((by.shape[1], *self._weight.shape))
+        send(self._slopes, self._rows, self._squares, by, out, np.empty(self._room))
+        return (out * self._sigma).reshape(len(out), -1)
+
+    def followed(self, covariance: FloatArray, images: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Let rows respond to images; give the responses and the images that these make.
+
+        Shapes: `covariance` (n, free, free), `images` (b, pixels), `felt` (n, b, free), `back` (b,
+        pixels).
+        """
+        seen = np.multiply(images.reshape(-1, *self._weight.shape), self._sigma, order="C")
+        felt = np.zeros((len(self._rows), len(images), covariance.shape[1]))
+        out = np.zeros_like(seen)
+        follow(
+            self._slopes, self._rows, self._squares, covariance, seen, felt, out,
+            np.empty(self._room), np.empty(covariance.shape[1]),
+        )  # fmt: skip
+        return felt, (out * self._sigma).reshape(images.shape)
+
 
 _SINGULAR = 1e-9
 _IMAGES = 4  # that are sent through E at a time

@@ -8,22 +8,24 @@ is not theirs alone yet: the sign of the contrast is the model's.
 
 from __future__ import annotations
 
-import logging
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
-from iscat_analysis._kernels.links import link_surely
-from iscat_analysis.errors import DataError
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.search.peaks import SAMPLED, maxima, summits
 from iscat_analysis.search.templates import FAR_LOBE, NEAR, SIDELOBE, Templates
+from iscat_analysis.tracking.field import MovingField
+from iscat_analysis.tracking.rows import BackgroundEstimate, Localizations
 
 IntArray = NDArray[np.int64]
+
+_BLOCK = 16  # frames that are searched at a time; more need room that is slow to clear
 
 LEFT_OVER = 0.2
 """Of a particle's signal-to-noise ratio that a candidate beside it must reach when what was fitted
@@ -195,80 +197,57 @@ def _ring(image: FloatArray, beyond_px: float) -> float:
     return float(answer[np.hypot(along, along[:, None]) >= beyond_px].max() / answer[0, 0])
 
 
-def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int) -> IntArray:
-    """Say which positions are one particle.
-
-    Notes
-    -----
-    What has no choice is linked at once, and the rest of each frame by
-    trackpy (D. B. Allan et al., doi:10.5281/zenodo.4682814), after J. C. Crocker and D. G. Grier,
-    J. Colloid Interface Sci. 179, 298 (1996).
-
-    Shapes: `frame` (n,), `places_nm` (n, axes), result (n,).
-    """
-    n = len(frame)
-    track = np.zeros(n, dtype=np.int64)
-    if not n:
-        return track
-    places = np.ascontiguousarray(places_nm, dtype=np.float64)
-    starts = np.searchsorted(frame, np.arange(frame[0], frame[-1] + 2)).astype(np.int64)
-    taken, waiting, doubtful = np.zeros(n, dtype=bool), track.copy(), track.copy()
-    state, t = np.zeros(4, dtype=np.int64), 0
-    while True:
-        t = link_surely(places, starts, t, reach_nm, memory, track, taken, waiting, state, doubtful)
-        if t == starts.size - 1:
-            break
-        _, number, some, others = state.tolist()
-        old, new = doubtful[:some], doubtful[some : some + others]
-        before = _chosen(places[old], places[new], reach_nm)
-        begun = before < 0
-        track[new[begun]] = number + np.arange(np.count_nonzero(begun))
-        last = old[before[~begun]]
-        track[new[~begun]], taken[last] = track[last], True
-        state[1] += np.count_nonzero(begun)
-        t += 1
-    _, first, numbers = np.unique(track, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[numbers]
+_SAMPLED = 4  # blocks, of which one tells whether the others are searched
 
 
-def _chosen(old: FloatArray, new: FloatArray, reach_nm: float) -> IntArray:
-    """Give the old position that trackpy links to each new one, -1 where there is none."""
-    trackpy = load_linker()
-    try:
-        (_, one), (_, two) = trackpy.link_iter(iter([(0, old), (1, new)]), search_range=reach_nm)
-    except trackpy.SubnetOversizeException as trouble:
-        raise DataError(
-            f"too many particles are within track.max_step_nm = {reach_nm:g} of each other to tell "
-            "which is which from frame to frame: lower it to the farthest that one goes, or record "
-            "fewer particles or more frames a second"
-        ) from trouble
-    where = {number: i for i, number in enumerate(one)}
-    return np.array([where.get(number, -1) for number in two], dtype=np.int64)
+RING_SLOPE = 1.7
+"""Distance of the outer rings of a particle over its height, tan 60°: within it, what is much
+fainter than the particle may be what the model leaves over of them."""
 
 
-@cache
-def load_linker() -> Any:
-    """Import trackpy without its log messages.
+def search_frames(
+    context: AnalysisContext,
+    field: MovingField,
+    ground: BackgroundEstimate,
+    rows: Localizations,
+    pool: ThreadPoolExecutor,
+    frames: tuple[int, int] | None = None,
+    *,
+    enough: int = 0,
+    cautious: bool = False,
+) -> FrameCandidates:
+    """Find candidates in the residual of the rows so far."""
+    side = context.roi_px
+    if context.mode == "joint":
+        side += round(2 * RING_SLOPE * context.config.fit.z_range_nm[1] / field.pixel_nm)
+    search = FrameFilter(
+        context.templates, ground.level, field.read_e2, field.used,
+        polarity=context.config.detection.sign, roi_px=side, cautious=cautious,
+    )  # fmt: skip
+    if frames is None:
+        field.draw(ground, rows)
+    starts = rows.starts(field.frames)
+    pixel = field.pixel_nm
+    places = np.column_stack([rows.theta[:, :2] / pixel, rows.snr])
 
-    The import takes about a second, so that it is worth starting it in a thread.
-    """
-    import trackpy
+    def block(first: int) -> FrameCandidates:
+        last = min(first + _BLOCK, end)
+        known = [places[starts[t] : starts[t + 1]] for t in range(first, last)]
+        return search.find(
+            field.residual(ground, rows, first, last), ground.power[first:last], first, known
+        )
 
-    logging.getLogger("trackpy").setLevel(logging.WARNING)
-    return trackpy
-
-
-def gaps(frame: IntArray, track: IntArray) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
-    """Give the frames inside tracks in which the particle was not found.
-
-    Shapes: `frame, track` (n,), `missed` (m,), `before, after` (m,), `share` (m,).
-    """
-    order = np.lexsort((frame, track))
-    before, after = order[:-1], order[1:]
-    wide = (track[before] == track[after]) & (frame[after] > frame[before] + 1)
-    before, after = before[wide], after[wide]
-    length = frame[after] - frame[before] - 1
-    first = np.cumsum(length) - length  # of the missed frames, that of each gap
-    steps = 1 + np.arange(length.sum()) - np.repeat(first, length)
-    before, after = np.repeat(before, length), np.repeat(after, length)
-    return frame[before] + steps, before, after, steps / (frame[after] - frame[before])
+    begin, end = frames or (0, field.frames)
+    blocks = list(range(begin, end, _BLOCK))
+    sample = blocks[:: _SAMPLED if enough else 1]
+    parts = dict(zip(sample, pool.map(block, sample), strict=True))
+    if sum(len(part.frame) for part in parts.values()) > enough / _SAMPLED:
+        others = [first for first in blocks if first not in parts]
+        parts |= zip(others, pool.map(block, others), strict=True)
+    found = [parts[first] for first in sorted(parts)]
+    return FrameCandidates(
+        *(
+            np.concatenate([getattr(part, name) for part in found])
+            for name in ("frame", "x_px", "y_px", "z_nm", "strength", "snr")
+        )
+    )

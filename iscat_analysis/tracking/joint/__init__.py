@@ -1,1 +1,0 @@
-"""The joint likelihood of moving particles and the background that they share."""
