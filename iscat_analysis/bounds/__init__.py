@@ -10,12 +10,7 @@ measurement that comes nearest to the light's own bound, and `paper` reproduces 
 from __future__ import annotations
 
 from iscat_analysis.bounds import paper
-from iscat_analysis.bounds.classical import (
-    EventBounds,
-    Unidentifiable,
-    bounds_from_matrices,
-    event_bounds,
-)
+from iscat_analysis.bounds.classical import EventBounds, bounds_from_matrices, event_bounds
 from iscat_analysis.bounds.detection import (
     DetectionLimit,
     detection_limit,
@@ -25,10 +20,9 @@ from iscat_analysis.bounds.detection import (
 from iscat_analysis.bounds.experiment import (
     Experiment,
     bounds_report,
+    findings_of,
     information_fraction,
     plan,
-    report_of,
-    warnings_of,
 )
 from iscat_analysis.bounds.holevo import (
     Holevo,
@@ -37,13 +31,10 @@ from iscat_analysis.bounds.holevo import (
     natural_bound,
     tradeoff,
 )
-from iscat_analysis.bounds.paper import Reproduction, reproduce
+from iscat_analysis.bounds.paper import reproduce
 from iscat_analysis.bounds.planning import (
     AXES,
-    Axis,
-    Best,
     Cost,
-    Effort,
     Goal,
     Scan,
     budget,
@@ -55,7 +46,7 @@ from iscat_analysis.bounds.planning import (
     parse_target,
     scan,
 )
-from iscat_analysis.bounds.pupil import KNOBS, PupilOptimum, optimize_pupil
+from iscat_analysis.bounds.pupil import PupilOptimum, optimize_pupil
 from iscat_analysis.bounds.quantum import (
     incompatible_pairs,
     quantum_bounds,
@@ -71,57 +62,3 @@ from iscat_analysis.bounds.shared import (
     peak_gradient,
     shared_sigma,
 )
-
-__all__ = [
-    "AXES",
-    "KNOBS",
-    "Axis",
-    "Best",
-    "Cost",
-    "DetectionLimit",
-    "Effort",
-    "EventBounds",
-    "Experiment",
-    "Goal",
-    "Holevo",
-    "PupilOptimum",
-    "Reproduction",
-    "Scan",
-    "Unidentifiable",
-    "bounds_from_matrices",
-    "bounds_report",
-    "budget",
-    "changed",
-    "detection_limit",
-    "displacement",
-    "effort",
-    "eliminated",
-    "event_bounds",
-    "holevo_bound",
-    "holevo_over_quantum",
-    "imitation",
-    "incompatible_pairs",
-    "information_fraction",
-    "joint_information",
-    "mass_drift",
-    "natural_bound",
-    "optimize",
-    "optimize_pupil",
-    "paper",
-    "parse_names",
-    "parse_scan",
-    "parse_target",
-    "peak_gradient",
-    "plan",
-    "power_known",
-    "power_searched",
-    "quantum_bounds",
-    "quantum_information",
-    "report_of",
-    "reproduce",
-    "scan",
-    "shared_sigma",
-    "tradeoff",
-    "warnings_of",
-    "z_nm_phase_free",
-]

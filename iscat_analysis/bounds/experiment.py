@@ -21,6 +21,8 @@ from iscat_analysis.bounds.quantum import (
 )
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.bounds import COARSE_SAMPLING, SATURATED_PLAN
 from iscat_analysis.inference.counts import asimov_conditional, asimov_poisson
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.models import TurningRod
@@ -163,12 +165,7 @@ def expected_likelihood(
 def bounds_report(config: Config) -> dict[str, Any]:
     """Everything `iscat bounds --json` prints."""
     experiment = plan(config)
-    return report_of(experiment)
-
-
-def report_of(experiment: Experiment) -> dict[str, Any]:
-    """Report one experiment; see `bounds_report`."""
-    config, model = experiment.config, experiment.model
+    model = experiment.model
     free = FREE_PARAMETERS[config.fit.mode]
     z_nm = float(experiment.theta[2])
     whole = experiment.bounds(PARAMETERS)
@@ -188,27 +185,26 @@ def report_of(experiment: Experiment) -> dict[str, Any]:
     light = experiment.collected * exact[np.ix_(index, index)] / np.outer(steps, steps)
     at_once = natural_bound(light)
     paper, _ = quantum_bounds(quantum_information(model, z_nm, measure="dong2021"))
-    per_photon = {
-        "crb_single": _named(NAMES, whole.crb_single * to_rel * root_camera),
-        "crb_joint": _named(NAMES, joint.crb_joint * to_rel * root_camera),
-        "qcrb": _named(NAMES, single * per_step * to_rel),
-        "qcrb_joint": _named(NAMES, joint_bounds * per_step * to_rel),
-        "qcrb_dong2021": _named(NAMES, paper * per_step * to_rel),
-    }
-    actual = {
-        "crb_single": _named(PARAMETERS, whole.crb_single),
-        "crb_joint": _named(PARAMETERS, joint.crb_joint),
-        "qcrb": _named(PARAMETERS, single * per_step / root_light),
-        "qcrb_joint": _named(PARAMETERS, joint_bounds * per_step / root_light),
-        "qcrb_dong2021": _named(PARAMETERS, paper * per_step / root_light),
-    }
+    per_photon: dict[str, dict[str, float]] = {}
+    actual: dict[str, dict[str, float]] = {}
+
+    def put(kind: str, values: FloatArray, root: float) -> None:
+        """Add bounds as they are, and per photon of a number whose square root is given."""
+        actual[kind] = _named(PARAMETERS, values)
+        per_photon[kind] = _named(NAMES, values * to_rel * root)
+
+    put("crb_single", whole.crb_single, root_camera)
+    put("crb_joint", joint.crb_joint, root_camera)
+    for kind, values in (
+        ("qcrb", single), ("qcrb_joint", joint_bounds), ("qcrb_dong2021", paper)
+    ):  # fmt: skip
+        put(kind, values * per_step / root_light, root_light)
     losses = {}
     if config.optics.analyzer or config.optics.mask_na:
         share = transmitted_over_collected(model, z_nm)
         passed, _ = quantum_bounds(quantum_information(model, z_nm, light="transmitted"))
-        passed = passed * per_step
-        per_photon["qcrb_transmitted"] = _named(NAMES, passed * to_rel)
-        actual["qcrb_transmitted"] = _named(PARAMETERS, passed / root_light / math.sqrt(share))
+        root = root_light * math.sqrt(share)
+        put("qcrb_transmitted", passed * per_step / root, root)
         losses = {"transmitted_over_collected": share}
     if not model.rho:
         alone = z_nm_phase_free(model, z_nm)
@@ -251,7 +247,7 @@ def report_of(experiment: Experiment) -> dict[str, Any]:
         },
         "convention": optics.convention,
         "emission": optics.emission,
-        "warnings": warnings_of(experiment),
+        "warnings": [finding.text for finding in findings_of(experiment)],
         **({"rod": _with_angles(experiment, rod)} if isinstance(rod, Rod) else {}),
     }
 
@@ -281,21 +277,14 @@ def information_fraction(bounds: EventBounds) -> FloatArray:
     return (bounds.qcrb / bounds.crb_single) ** 2
 
 
-def warnings_of(experiment: Experiment) -> list[str]:
-    """Warn of what makes the bounds unattainable or wrong, one line each."""
-    config, lines = experiment.config, []
-    well_depth_e = config.camera.well_depth_e
+def findings_of(experiment: Experiment) -> list[Finding]:
+    """Find what makes the bounds unattainable or wrong."""
+    found, well_depth_e = [], experiment.config.camera.well_depth_e
     if well_depth_e is not None and experiment.peak_e >= well_depth_e:
-        lines.append(
-            f"the brightest pixel expects {experiment.peak_e:.3g} e per frame, above "
-            f"camera.well_depth_e = {well_depth_e:.3g}: lower bounds.photons_per_pixel"
-        )
+        found.append(SATURATED_PLAN({"peak_e": experiment.peak_e, "well_depth_e": well_depth_e}))
     if experiment.on_camera > (1 + LOST_LIGHT) * experiment.collected:
-        lines.append(
-            f"pixels of {experiment.grid.pixel_nm:g} nm sampled at their centres count more light "
-            'than was collected: set camera.samples_per_pixel = "auto"'
-        )
-    return lines
+        found.append(COARSE_SAMPLING({"pixel_nm": experiment.grid.pixel_nm}))
+    return found
 
 
 def _named(names: tuple[str, ...], values: FloatArray) -> dict[str, float]:

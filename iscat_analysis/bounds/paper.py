@@ -297,14 +297,14 @@ def rectangle_rule_bounds(scheme: str) -> FloatArray:
     pupil = make_pupil(
         theta, weight, wavenumber=model.wavenumber, n_immersion=optics.n_immersion,
         n_glass=optics.n_glass, n_sample=optics.n_sample,
-        direction=1.0 if scheme == "iscat" else -1.0, reciprocal=False,
+        direction=optics.direction, reciprocal=False,
     )  # fmt: skip
     phi = np.linspace(0.0, 2 * math.pi, TABLE_NODES)
     p, s = np.abs(pupil.t_p_cos) ** 2, np.abs(pupil.t_s) ** 2
     density = np.outer(p, np.cos(phi) ** 2) + np.outer(s, np.sin(phi) ** 2)
     density *= pupil.apodization[:, None] ** 2
     density /= density.sum()
-    kappa = pupil.axial.real / (1.0 if scheme == "iscat" else optics.n_sample)
+    kappa = pupil.axial.real / (1.0 if optics.kind.reflected else optics.n_sample)
     slopes = (
         np.outer(pupil.transverse, np.cos(phi)),
         np.outer(pupil.transverse, np.sin(phi)),

@@ -25,7 +25,7 @@ from numba import get_num_threads
 from pydantic import ValidationError
 
 from iscat_analysis.bounds.classical import bounds_from_matrices
-from iscat_analysis.bounds.experiment import Experiment, information_fraction, plan
+from iscat_analysis.bounds.experiment import Experiment, detector, information_fraction, plan
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.forward import MassScale, forward_model
@@ -51,11 +51,7 @@ class Axis:
 
 
 def _pixel_nm(config: Config) -> float:
-    if config.camera.pixel_size_nm is None:
-        raise ConfigError(
-            "camera.pixel_size_nm is missing: give it, as in camera.pixel_size_nm = 84.4"
-        )
-    return config.camera.pixel_size_nm
+    return detector(config)[0]
 
 
 def _height(config: Config) -> float:
@@ -64,7 +60,7 @@ def _height(config: Config) -> float:
 
 
 def _attenuated(config: Config, value: float) -> Mapping[str, Mapping[str, Any]]:
-    if config.optics.scheme == "darkfield":
+    if not config.optics.interferes:
         raise ConfigError(
             "attenuation: dark field has no reference to attenuate; choose optics.scheme = "
             '"iscat" or "cobri"'
@@ -78,7 +74,7 @@ def _pixelated(config: Config, value: float) -> Mapping[str, Mapping[str, Any]]:
     old = _pixel_nm(config)
     side = config.bounds.pixels * old
     photons = config.bounds.photons_per_pixel
-    if config.optics.scheme != "darkfield":
+    if config.optics.interferes:
         photons *= (value / old) ** 2
     return {
         "camera": {"pixel_size_nm": value},
@@ -378,7 +374,7 @@ class Effort:
 def effort(config: Config, goal: Goal) -> list[Effort]:
     """How many frames and photons a precision takes."""
     before = config.bounds.n_before
-    finite = config.optics.scheme != "darkfield" or config.background.level_e is not None
+    finite = config.optics.interferes or config.background.level_e is not None
     backgrounds: list[tuple[str, Callable[[int], int]]] = []
     if before and finite:
         backgrounds.append((f"{before} frames before", lambda _: before))
@@ -389,7 +385,9 @@ def effort(config: Config, goal: Goal) -> list[Effort]:
 
 def _effort(config: Config, goal: Goal, name: str, before: Callable[[int], int]) -> Effort:
     def bound(n_after: int) -> float:
-        return _bound(_with(config, bounds={"n_after": n_after, "n_before": before(n_after)}), goal)
+        return _bound(
+            with_keys(config, bounds={"n_after": n_after, "n_before": before(n_after)}), goal
+        )
 
     one = bound(1)
     if not math.isfinite(one):
@@ -413,7 +411,7 @@ def _effort(config: Config, goal: Goal, name: str, before: Callable[[int], int])
             frames += step
         while frames > step and bound(frames - step) <= goal.value:
             frames -= step
-    reached = plan(_with(config, bounds={"n_after": frames, "n_before": before(frames)}))
+    reached = plan(with_keys(config, bounds={"n_after": frames, "n_before": before(frames)}))
     rate = config.camera.frame_rate_hz
     seconds = (frames + before(frames)) / rate if rate else None
     return Effort(name, before(frames), frames, seconds, reached.collected)
@@ -432,8 +430,8 @@ def budget(config: Config, parameter: str) -> list[Cost]:
     """Where the precision goes, from the light's own bound to this experiment's."""
     free = FREE_PARAMETERS[config.fit.mode]
     at = PARAMETERS.index(parameter)
-    quiet = _with(config, camera={"read_noise_e": 0.0}, bounds={"n_before": 0})
-    fine = _with(quiet, **_refined(quiet))
+    quiet = with_keys(config, camera={"read_noise_e": 0.0}, bounds={"n_before": 0})
+    fine = with_keys(quiet, **_refined(quiet))
     ideal = plan(fine).bounds(PARAMETERS)
     steps = [
         ("quantum bound", float(ideal.qcrb[at])),
@@ -442,7 +440,7 @@ def budget(config: Config, parameter: str) -> list[Cost]:
     ]
     for cause, one in (
         ("pixelation", quiet),
-        ("finite background", _with(config, camera={"read_noise_e": 0.0})),
+        ("finite background", with_keys(config, camera={"read_noise_e": 0.0})),
         ("read noise", config),
     ):
         steps.append((cause, float(plan(one).bounds(free).crb_joint[at])))
@@ -460,23 +458,18 @@ MOST_PIXELS = 1200
 """Side of the finest field."""
 
 
-def _refined(config: Config) -> dict[str, dict[str, Any]]:
+def _refined(config: Config) -> Mapping[str, Mapping[str, Any]]:
     """Divide the same field into pixels so small that they cost nothing."""
     pixel = config.camera.pixel_size_nm
     if pixel is None:
         return {}
     wanted = math.ceil(pixel * FINE_PIXELS * config.optics.na / config.optics.wavelength_nm)
     split = max(1, min(wanted, MOST_PIXELS // config.bounds.pixels))
-    photons = config.bounds.photons_per_pixel
-    if config.optics.scheme != "darkfield":
-        photons /= split**2
-    return {
-        "camera": {"pixel_size_nm": pixel / split},
-        "bounds": {"pixels": config.bounds.pixels * split, "photons_per_pixel": photons},
-    }
+    return _pixelated(config, pixel / split)
 
 
-def _with(config: Config, **sections: dict[str, Any]) -> Config:
+def with_keys(config: Config, **sections: Mapping[str, Any]) -> Config:
+    """Replace keys of sections of a configuration, which is checked again."""
     values = config.model_dump(exclude_none=True)
     for section, keys in sections.items():
         values.setdefault(section, {}).update(keys)

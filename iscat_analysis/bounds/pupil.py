@@ -33,7 +33,7 @@ import scipy
 from iscat_analysis.bounds.classical import bounds_from_matrices
 from iscat_analysis.bounds.experiment import Experiment, plan
 from iscat_analysis.bounds.holevo import Holevo, holevo_bound
-from iscat_analysis.bounds.planning import calibrated_scale
+from iscat_analysis.bounds.planning import calibrated_scale, with_keys
 from iscat_analysis.bounds.quantum import transmitted_over_collected
 from iscat_analysis.config import Config, Optics
 from iscat_analysis.errors import ConfigError
@@ -372,16 +372,8 @@ def _result(
     bound = _holevo(there, chosen)
     at = [PARAMETERS.index(name) for name in chosen]
     sigma, own = sigmas(there)
-    quiet, _ = sigmas(
-        plan(
-            best.model_copy(
-                update={
-                    "camera": best.camera.model_copy(update={"read_noise_e": 0.0}),
-                    "bounds": best.bounds.model_copy(update={"n_before": 0}),
-                }
-            )
-        )
-    )
+    silent_camera = with_keys(best, camera={"read_noise_e": 0.0}, bounds={"n_before": 0})
+    quiet, _ = sigmas(plan(silent_camera))
     before, _ = sigmas(here)
     joint = FREE_PARAMETERS[config.fit.mode]
     holevo_sigma = dict(zip(joint, bound.sigma, strict=True))
@@ -460,7 +452,7 @@ def _chosen(config: Config, chosen: Sequence[str] | None) -> tuple[str, ...]:
 
 def _free(config: Config, free: Sequence[str] | None) -> tuple[str, ...]:
     optics = config.optics
-    if optics.scheme == "darkfield":
+    if not optics.interferes:
         raise ConfigError(
             "`optimize` = pupil: dark field has no reference whose phase and strength could be "
             'chosen; choose optics.scheme = "iscat" or "cobri"'

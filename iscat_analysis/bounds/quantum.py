@@ -70,7 +70,7 @@ def quantum_information(
     opening, wave, solid = _light(model, centre, measure, light, amplitude)
     pupil = opening.pupil
     kappa = pupil.axial
-    if measure == "dong2021" and model.optics.scheme != "iscat":
+    if measure == "dong2021" and not model.optics.kind.reflected:
         kappa = kappa / model.optics.n_sample
     weight = solid[:, None] / (np.abs(wave) ** 2 * solid[:, None]).sum()
     phi = _azimuths()

@@ -29,6 +29,8 @@ from iscat_analysis.bounds.classical import event_bounds
 from iscat_analysis.bounds.experiment import detector, expected_likelihood
 from iscat_analysis.config import Config, refuse_rod
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.bounds import FAINT_PICTURES, PICTURES_LEFT_OUT
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, ForwardModel, forward_model
@@ -232,20 +234,12 @@ class OpticsForecast:
         )
 
     @property
-    def warnings(self) -> tuple[str, ...]:
-        """What the user should know, one sentence each."""
-        found = []
-        if self.snr < FAINTEST:
-            found.append(
-                f"one picture has a signal-to-noise ratio of {self.snr:.2g}, and iscat calibrate "
-                f"optics uses those above {FAINTEST:g}: take heavier particles, more frames, or "
-                "more light"
-            )
-        if self.events > MOST_IMAGES:
-            found.append(
-                f"of {self.events} pictures iscat calibrate optics uses the {MOST_IMAGES} brightest"
-            )
-        return tuple(found)
+    def findings(self) -> tuple[Finding, ...]:
+        """What the user should know."""
+        faint = FAINT_PICTURES({"snr": self.snr, "least": FAINTEST})
+        many = PICTURES_LEFT_OUT({"events": self.events, "used": MOST_IMAGES})
+        said = ((self.snr < FAINTEST, faint), (self.events > MOST_IMAGES, many))
+        return tuple(finding for applies, finding in said if applies)
 
     def to_dict(self) -> dict[str, Any]:
         """Give what ``iscat bounds --for optics --json`` prints."""
@@ -275,7 +269,7 @@ class OpticsForecast:
                 for mode, sigma in self.sigma.items()
             },
             "goals": dict(GOALS),
-            "warnings": list(self.warnings),
+            "warnings": [finding.text for finding in self.findings],
             "needed": self.needed.to_dict("records"),
         }
 
@@ -309,7 +303,7 @@ def forecast_optics(
 def _names(config: Config, free: str | Sequence[str] | None) -> tuple[str, ...]:
     """Give the continuous parameters that these groups stand for in this microscope."""
     optics = config.optics
-    if optics.scheme == "darkfield" or optics.convention == "dong2021":
+    if not optics.interferes or optics.convention == "dong2021":
         raise ConfigError(
             f'optics.scheme = "{optics.scheme}", optics.convention = "{optics.convention}": optics '
             'are learned from interference with a reference, in the convention "exact"'

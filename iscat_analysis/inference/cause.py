@@ -161,7 +161,7 @@ def likely_cause(
         step=step if name in _UNITS else None,
         unit=_UNITS.get(name, ""),
         events=len(fits),
-        learned=config.optics.scheme != "darkfield",
+        learned=config.optics.interferes,
         other_steps=tuple(others),
         rivals=tuple((n, named[n][0][1], _UNITS[n]) for n in rivals),
     )
@@ -194,7 +194,7 @@ def _explained_by(
         steps = steps if turns else asked
     best = (share, float(steps[0]))
     whole: list[tuple[float, float]] = []
-    dark = config.optics.scheme == "darkfield"
+    dark = not config.optics.interferes
     for far in _FAR.get(name, ()) if not dark else _FAR_DARK.get(name, _FAR.get(name, ())):
         if not (there := _neighbours(config, name, reach, far)):
             continue

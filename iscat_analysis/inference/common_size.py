@@ -44,14 +44,14 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels.hessian import PAIRS
 from iscat_analysis._kernels.scoring import LARGEST_GAIN_RATIO
-from iscat_analysis.inference.fit import AMPLITUDE, fit_particle
+from iscat_analysis.inference.fit import AMPLITUDE, FOLLOWED, fit_particle
 from iscat_analysis.inference.laws import PixelTerms
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.maximiser import Optimum, covariance_of, maximise
 from iscat_analysis.inference.models import ParticleModel, SphereOfIndex
 from iscat_analysis.inference.sizes import (
+    AMBIGUITY_ODDS,
     OTHER_SIZE,
-    SURE_ODDS,
     highest_maxima,
     scan_sizes,
     scanned_heights,
@@ -62,12 +62,8 @@ from iscat_analysis.records import BoolArray, Box, Candidate, FitResult, FloatAr
 
 IntArray = NDArray[np.int64]
 
-FOLLOWED, HEIGHTS = 4, 3
+_MAXIMA, _HEIGHTS = 4, 3
 """Maxima of a scan of diameters that are followed, and heights of each frame at each of them."""
-
-GIVEN_UP = 30.0
-"""Log-likelihood below the best maximum at which another is given up, when its next scoring step
-could not reach more."""
 
 UNDETERMINED = 0.5
 """Error of n − n_s, over its size, from which the index is not told."""
@@ -147,17 +143,17 @@ def common_sizes(
         ]
     )
     found: list[CommonSize] = []
-    for (k,) in highest_maxima(scans.max(axis=2).sum(axis=0), FOLLOWED):
+    for (k,) in highest_maxima(scans.max(axis=2).sum(axis=0), _MAXIMA):
         starts = [
             (f, [*places[f, :2], heights[at]])
             for f, scan in enumerate(scans[:, k])
-            for (at,) in highest_maxima(scan, HEIGHTS)
+            for (at,) in highest_maxima(scan, _HEIGHTS)
         ]
         best = max((one.log_likelihood for one in found if one.converged), default=-math.inf)
         one = fit_common_size(
             likelihoods, model, np.array([place for _, place in starts]), z_range_nm,
             frames=np.array([f for f, _ in starts]), mass_kda=float(masses[k]),
-            least=best - GIVEN_UP,
+            least=best - FOLLOWED,
         )  # fmt: skip
         if one is not None and not any(
             abs(one.mass_kda / other.mass_kda - 1) < 1e-3 for other in found
@@ -387,7 +383,7 @@ def _still_likely(
     """
     gain = 0.5 * np.einsum("bi,bij,bj->b", here.place_score, here.place_inverse, here.place_score)
     best = here.values[_best_of_each(here.values, owners)][owners]
-    kept = here.values + LARGEST_GAIN_RATIO * gain >= best - GIVEN_UP
+    kept = here.values + LARGEST_GAIN_RATIO * gain >= best - FOLLOWED
     for b in np.flatnonzero(kept):
         rivals = kept & (owners == owners[b]) & (np.abs(places[:, 2] - places[b, 2]) < apart_nm)
         kept[b] = b == np.flatnonzero(rivals)[np.argmax(here.values[rivals])]
@@ -559,7 +555,7 @@ def _maxima(
         (one for one in tried if one is not None and one.converged),
         key=lambda one: -one.log_likelihood,
     )
-    least = found[0].log_likelihood - math.log(SURE_ODDS) if found else math.inf
+    least = found[0].log_likelihood - math.log(AMBIGUITY_ODDS) if found else math.inf
     return [one for one in found if one.log_likelihood > least]
 
 

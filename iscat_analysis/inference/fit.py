@@ -53,8 +53,10 @@ from iscat_analysis.inference.laws import MANY_COUNTS
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, ModelLikelihood
 from iscat_analysis.inference.maximiser import Optimum, covariance_of
 from iscat_analysis.inference.sizes import (
+    AMBIGUITY_ODDS,
     OTHER_SIZE_SHARE,
     has_other_size,
+    scanned_heights,
     size_probability,
     size_starts,
 )
@@ -89,9 +91,6 @@ _SUSPECTS = 8  # largest residuals whose exact tail is looked up
 AWAY = 3.0
 """Standard deviations from the maximum at which the likelihood is looked at."""
 
-AMBIGUITY_ODDS = 1000.0
-"""A second height whose odds against the best are shorter than this is reported as ambiguous."""
-
 POOR_FIT_P = 1e-3
 """p-value below which the model is said not to describe the data: 1 good fit in 1000."""
 
@@ -105,9 +104,6 @@ what was found does not describe the data."""
 OUTWARD = 3.0
 """Standard deviations by which the data pull a height beyond the end of its range, or a mass beyond
 the end of a calibration's line, before the fit is said to be at a bound: fewer are chance."""
-
-SCANS_PER_FRINGE = 8
-"""Heights scanned per interference fringe before fitting."""
 
 AMPLITUDE = 3
 """Index of the amplitude in θ."""
@@ -162,20 +158,13 @@ def _box_around(
         -largest if signed else smallest, -1.0,
     )  # fmt: skip
     upper = min(x + reach, right), min(y + reach, bottom), z_range_nm[1], largest, 1.0
-    return Box(np.array(free), _where(free, lower, fixed), _where(free, upper, fixed))
+    return Box(np.array(free), np.where(free, lower, fixed), np.where(free, upper, fixed))
 
 
 def _searched(prior: HeightPrior, known_nm: tuple[float, float]) -> tuple[float, float]:
     """Range of heights in which a prior and a model let a particle be searched."""
     low, high = prior.range_nm
     return max(low, known_nm[0]), min(high, known_nm[1])
-
-
-def _where(free: list[bool], ends: Sequence[float], fixed: Sequence[float]) -> FloatArray:
-    """Select one end of the range of each free parameter, and the value of each fixed one."""
-    return np.array(
-        [end if moves else value for moves, end, value in zip(free, ends, fixed, strict=True)]
-    )
 
 
 def fit_particle(
@@ -375,7 +364,7 @@ class _Found(NamedTuple):
     best: Optimum
     chi2_reduced: float
     p_value: float
-    walls: list[bool]
+    walls: BoolArray
     slope: float
     known: bool
     sigma: FloatArray
@@ -390,7 +379,7 @@ def _judged(likelihood: Likelihood, best: Optimum, box: Box) -> _Found:
     walls = _walls(best.theta, box)
     slope = abs(likelihood.model.scale.slope(float(best.theta[AMPLITUDE])))
     known, sigma, covariance, bias = precision(
-        likelihood, best.theta, best.fisher, box.free, derivatives, walls=np.array(walls),
+        likelihood, best.theta, best.fisher, box.free, derivatives, walls=walls,
         slope=slope,
     )  # fmt: skip
     return _Found(best, chi2_reduced, p_value, walls, slope, known, sigma, covariance, bias)
@@ -431,8 +420,7 @@ def _heights(likelihood: Likelihood, theta: FloatArray, box: Box) -> list[tuple[
     Each start is θ with a maximum's height and amplitude; beside it the log-likelihood there.
     """
     low, high, given = float(box.lower[2]), float(box.upper[2]), float(theta[2])
-    count = max(math.ceil((high - low) / likelihood.model.fringe_nm * SCANS_PER_FRINGE) + 1, 3)
-    heights = sorted({*np.linspace(low, high, count).tolist(), given})
+    heights = sorted({*scanned_heights(likelihood.model, low, high).tolist(), given})
     bounds = (float(box.lower[3]), float(box.upper[3])) if box.free[3] else None
     values, amplitudes = likelihood.scan_heights(np.array(heights), theta, bounds)
     padded = [-math.inf, *values.tolist(), -math.inf]
@@ -473,15 +461,10 @@ def _alternatives(optima: list[Optimum]) -> tuple[Alternative, ...]:
     return tuple(sorted(others, key=lambda a: a.log_likelihood_gap))
 
 
-def _walls(theta: FloatArray, box: Box) -> list[bool]:
+def _walls(theta: FloatArray, box: Box) -> BoolArray:
     """Tell which free parameters ended at a limit of the box."""
-    places = zip(
-        box.free.tolist(), theta.tolist(), box.lower.tolist(), box.upper.tolist(), strict=True
-    )
-    return [
-        free and min(value - low, high - value) < 1e-6 * (high - low)
-        for free, value, low, high in places
-    ]
+    near = np.minimum(theta - box.lower, box.upper - theta) < 1e-6 * (box.upper - box.lower)
+    return np.asarray(box.free & near)
 
 
 def _is_small(bias: FloatArray, sigma: FloatArray, box: Box, slope: float) -> bool:
@@ -489,13 +472,12 @@ def _is_small(bias: FloatArray, sigma: FloatArray, box: Box, slope: float) -> bo
 
     The amplitude's error is in units of `slope` per unit of the amplitude.
     """
-    x, y, z, amplitude, _ = bias.tolist()
-    each = zip((x, y, z, slope * amplitude), sigma.tolist(), box.free.tolist()[:4], strict=True)
-    return all(abs(size) <= error for size, error, free in each if free)
+    sizes = np.abs(bias[:4]) * [1.0, 1.0, 1.0, slope]
+    return bool(np.all((sizes <= sigma) | ~box.free[:4]))
 
 
 def _at_bound(
-    likelihood: Likelihood, theta: FloatArray, walls: list[bool], sigma_z_nm: float
+    likelihood: Likelihood, theta: FloatArray, walls: BoolArray, sigma_z_nm: float
 ) -> bool:
     """Whether the search ended where the data do not want it to end.
 

@@ -28,6 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from iscat_analysis.config import Config
+from iscat_analysis.medians import SIGMA_PER_MAD
 from iscat_analysis.records import FloatArray
 
 REACH = 5.0
@@ -125,7 +126,7 @@ def spread_of_heights(z_nm: FloatArray, sigma_nm: FloatArray) -> HeightSpread | 
     z, v = z_nm[known], sigma_nm[known] ** 2
     if z.size >= FEWEST:
         away = np.abs(z - np.median(z))
-        kept = away <= _OUTLIER_SIGMAS * np.sqrt((1.48 * np.median(away)) ** 2 + v)
+        kept = away <= _OUTLIER_SIGMAS * np.sqrt((SIGMA_PER_MAD * np.median(away)) ** 2 + v)
         z, v = z[kept], v[kept]
     if z.size < FEWEST:
         return None

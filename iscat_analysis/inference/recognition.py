@@ -22,9 +22,9 @@ from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.maximiser import Optimum, covariance_of
 from iscat_analysis.inference.models import SphereOfIndex, SphereOfLight
 from iscat_analysis.inference.sizes import (
+    AMBIGUITY_ODDS,
     OTHER_SIZE,
     OTHER_SIZE_SHARE,
-    SURE_ODDS,
     highest_maxima,
     scanned_masses,
 )
@@ -98,7 +98,7 @@ def recognised(
 ) -> tuple[Likelihood, FitResult] | None:
     """Fit the sphere that describes a particle better than any dipole; None if there is none."""
     each = math.log(likelihood.n_pixels) / 2
-    least = fit.log_likelihood + math.log(SURE_ODDS)
+    least = fit.log_likelihood + math.log(AMBIGUITY_ODDS)
     found: list[_Sphere] = []
     begin = _centred(likelihood, fit.theta)
     for model in spheres:
@@ -106,7 +106,7 @@ def recognised(
         cost = each if model.fits_index else 0.0
         for one in _maxima(seated, begin, least=least + cost, level=level):
             found.append(one._replace(criterion=one.optimum.log_likelihood - cost))
-            least = max(least, found[-1].criterion - math.log(SURE_ODDS))
+            least = max(least, found[-1].criterion - math.log(AMBIGUITY_ODDS))
     if not found:
         return None
     found.sort(key=lambda one: -one.criterion)
@@ -125,7 +125,7 @@ def recognised(
         if not best.is_like(other)
     )
     flags = list(sphere[1].flags)
-    if others and others[0].log_likelihood_gap < math.log(SURE_ODDS):
+    if others and others[0].log_likelihood_gap < math.log(AMBIGUITY_ODDS):
         flags.append(Status.AMBIGUOUS_SIZE)
     status, noticed = verdict(flags)
     shift = fit.x_nm - float(fit.estimate[0]), fit.y_nm - float(fit.estimate[1])

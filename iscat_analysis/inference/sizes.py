@@ -18,6 +18,7 @@ from scipy.special import ndtr
 
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.maximiser import Optimum
+from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.records import Alternative, Box
 
@@ -33,8 +34,9 @@ phase of the light scattered backwards."""
 HEIGHTS_PER_FRINGE = 8
 """Heights scanned per interference fringe."""
 
-SURE_ODDS = 1000.0
-"""Another diameter whose odds against the best are shorter than this is reported as ambiguous."""
+AMBIGUITY_ODDS = 1000.0
+"""Another height or diameter whose odds against the best are shorter than this is reported as
+ambiguous."""
 
 OTHER_SIZE = 3.0
 """Standard errors of the mass beyond which another maximum has another size."""
@@ -92,7 +94,7 @@ def scan_sizes(
     return values
 
 
-def scanned_heights(model: SizedModel, low_nm: float, high_nm: float) -> FloatArray:
+def scanned_heights(model: ForwardModel, low_nm: float, high_nm: float) -> FloatArray:
     """Heights of a scan from one end of a range to the other [nm], shape (n,)."""
     count = math.ceil((high_nm - low_nm) / model.fringe_nm * HEIGHTS_PER_FRINGE) + 1
     return np.linspace(low_nm, high_nm, max(count, 3))
@@ -113,7 +115,7 @@ def has_other_size(alternatives: Sequence[Alternative], best: Optimum, sigma_kda
     """Whether another maximum, almost as likely, has another diameter."""
     mass = float(best.theta[3])
     return any(
-        other.log_likelihood_gap < math.log(SURE_ODDS)
+        other.log_likelihood_gap < math.log(AMBIGUITY_ODDS)
         and abs(other.mass_kda - mass) > OTHER_SIZE * sigma_kda
         for other in alternatives
     )

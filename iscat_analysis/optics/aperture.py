@@ -203,7 +203,7 @@ def aperture_on(
 
     Shapes: `theta, weight` (n,).
     """
-    wavenumber, direction = 2 * math.pi / optics.wavelength_nm, _direction(optics)
+    wavenumber, direction = 2 * math.pi / optics.wavelength_nm, optics.direction
     pupil = make_pupil(
         theta,
         weight,
@@ -219,11 +219,6 @@ def aperture_on(
         along, across = scatterer.pattern(cos_s, direction, optics.n_sample, wavenumber)
         pupil = replace(pupil, t_p_cos=pupil.t_p_cos / cos_s * along, t_s=pupil.t_s * across)
     return Aperture(optics, pupil, scatterer)
-
-
-def _direction(optics: Optics) -> float:
-    """1 where the light that is scattered backwards is collected, −1 forwards."""
-    return 1.0 if optics.scheme == "iscat" else -1.0
 
 
 def aperture(

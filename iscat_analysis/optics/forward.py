@@ -84,9 +84,9 @@ def forward_model(
     opening = _pupil(optics, reach_nm, ns * z_max_nm, ni * abs(oil_nm), nodes, scatterer)
     reflection = (ng - ns) / (ng + ns)
     transmission = math.sqrt(1 - reflection**2) if paper else 2 * ng / (ng + ns)
-    if optics.scheme == "darkfield":
+    if not optics.interferes:
         reference = 0.0
-    elif optics.scheme == "iscat":
+    elif optics.kind.reflected:
         reference = optics.attenuation * abs(reflection)
     else:
         forward = 2 * ns / (ns + ng) if reciprocal else transmission
@@ -95,7 +95,7 @@ def forward_model(
     if sphere is None:  # that of a sphere is in its pattern
         polarizability_nm3 *= (matter.permittivity - ns**2) / (matter.permittivity + 2 * ns**2)
     if reciprocal:
-        incident = transmission if optics.scheme == "iscat" else 1.0
+        incident = transmission if optics.kind.reflected else 1.0
         strength = (ns * k) ** 2 * polarizability_nm3 * incident / (4 * math.pi)
         front = -1j * k * ni / 2
     else:

@@ -27,7 +27,6 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.last_used import memoize
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.optics.model import ForwardModel
-from iscat_analysis.optics.waves import LatticeField, RadialField
 
 DRIFT = "focus_drift_nm"
 """Rise of the focus in 1000 frames of a movie [nm]."""
@@ -135,15 +134,12 @@ def changed(optics: Optics, changes: Mapping[str, float]) -> Optics:
 
 def brighter(model: ForwardModel, change: float) -> ForwardModel:
     """Give the model of a reference whose amplitude is larger by a share."""
-    wave, share = model.wave, 1 / (1 + change)
-    if not change or not isinstance(wave, RadialField | LatticeField):
+    if not change or model.is_measured:
         return model
-    if isinstance(wave, RadialField):
-        dimmed: RadialField | LatticeField = replace(wave, source=wave.source * share)
-    else:
-        dimmed = replace(wave, harmonics=wave.harmonics * share)
+    share = 1 / (1 + change)
     factor, reference = model.factor * share, model.reference / share
-    return replace(model, wave=dimmed, factor=factor, reference=reference)
+    dimmed = ForwardModel.dimmed(model, share)  # spheres of other masses follow the factor
+    return replace(dimmed, factor=factor, reference=reference)
 
 
 def centre_of(optics: Optics, field_px: tuple[int, int]) -> tuple[float, float, float]:
@@ -214,7 +210,7 @@ def refuse_moving_focus(config: Config) -> None:
 def refuse_uneven_field(config: Config) -> None:
     """Refuse optics that differ over the field where one model serves all of it."""
     terms = [name for name in terms_of(config.optics) if name not in MOVES]
-    if terms and (config.fit.mode == "track" or config.optics.psf == "measured"):
+    if terms and (config.fit.follows_tracks or config.optics.psf == "measured"):
         raise ConfigError(
             f"optics: {terms[0]} says that the microscope is not the same over the field, which "
             'is known only of particles that stay, with optics.psf = "model": set it to 0'

@@ -148,7 +148,7 @@ class ForwardModel:
         del amplitude  # a dipole has one picture
         return self
 
-    def dimmed(self, factor: ComplexArray) -> Self:
+    def dimmed(self, factor: ComplexArray | float) -> Self:
         """Multiply every plane wave of the light by a complex factor; shapes: `factor` (n,)."""
         wave = self.wave
         if isinstance(wave, RadialField):

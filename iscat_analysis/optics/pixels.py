@@ -33,7 +33,7 @@ def bandwidth(optics: Optics) -> float:
 
     That of the interference; in dark field of the scattered light, twice as much.
     """
-    return 2 * math.pi / optics.wavelength_nm * optics.na * (1 + (optics.scheme == "darkfield"))
+    return 2 * math.pi / optics.wavelength_nm * optics.na * (2 - optics.interferes)
 
 
 @dataclass(frozen=True)

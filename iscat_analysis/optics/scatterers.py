@@ -219,9 +219,11 @@ def scattering_length_nm(sphere: Sphere, optics: Optics) -> float:
 
     Of a small sphere it is d ((m² − 1)/(m² + 2))^(1/3), in proportion to the diameter.
     """
-    direction = 1.0 if optics.scheme == "iscat" else -1.0
     along = sphere.pattern(
-        np.ones(1, dtype=complex), direction, optics.n_sample, 2 * np.pi / optics.wavelength_nm
+        np.ones(1, dtype=complex),
+        optics.direction,
+        optics.n_sample,
+        2 * np.pi / optics.wavelength_nm,
     )[1]
     return float(sphere.diameter_nm * np.cbrt(abs(along[0])))
 

@@ -104,7 +104,7 @@ class SizedModel(ForwardModel):
         linear = ForwardModel(**{**parts_of(self), "aperture": opening, "wave": wave})
         return linear.dimmed(np.asarray(self.dimming, dtype=complex))
 
-    def dimmed(self, factor: ComplexArray) -> Self:
+    def dimmed(self, factor: ComplexArray | float) -> Self:
         """As `ForwardModel.dimmed`."""
         return replace(super().dimmed(factor), dimming=self.dimming * factor)
 

@@ -6,24 +6,28 @@ Bounds for arrays of set-ups.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from iscat_analysis.bounds import event_bounds, quantum_information
+from iscat_analysis.bounds import event_bounds, quantum_bounds, quantum_information
 from iscat_analysis.bounds.experiment import expected_likelihood
 from iscat_analysis.config import Calibration, CameraConfig, Config, Optics, Particle
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import number_in, truth_in
 from iscat_analysis.inference.likelihood import LEVEL
 from iscat_analysis.inference.models import TurningRod
+from iscat_analysis.last_used import memoize
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.optics.model import collected_area_nm2, photons_per_intensity
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.optics.scatterers import ANGLES, Rod
 from iscat_analysis.pieces.counts import LARGEST_REGION, config_of, darkfield_photons, together
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
+
+_FOCI_KEPT = 64  # models of single foci
 
 
 def psf(
@@ -194,10 +198,11 @@ def crb(
     """
     config = config_of(optics, particle, camera, mode=mode, calibration=calibration)
     side = int(number_in("pixels", pixels, least=2, most=LARGEST_REGION, whole=True))
-    setups = _Setups(
-        config, side, x_nm=x_nm, y_nm=y_nm, z_nm=z_nm, mass_kda=mass_kda, focus_nm=focus_nm,
-        photons_per_pixel=photons_per_pixel, n_after=n_after, n_before=n_before,
-    )  # fmt: skip
+    given = {
+        "x_nm": x_nm, "y_nm": y_nm, "z_nm": z_nm, "mass_kda": mass_kda, "focus_nm": focus_nm,
+        "photons_per_pixel": photons_per_pixel, "n_after": n_after, "n_before": n_before,
+    }  # fmt: skip
+    setups = _Setups(config, side, given)
     joint, level = truth_in("joint", joint), truth_in("level", level)
     free = FREE_PARAMETERS[mode] + (ANGLES if particle.is_rod else ())
     index = [(*PARAMETERS, *ANGLES).index(name) for name in free]
@@ -283,10 +288,11 @@ def qcrb(
     2.0
     """
     config = config_of(optics, particle, camera, mode=mode, calibration=calibration)
-    setups = _Setups(
-        config, 2, x_nm=0.0, y_nm=0.0, z_nm=z_nm, mass_kda=mass_kda, focus_nm=focus_nm,
-        photons_per_pixel=photons_per_pixel, n_after=n_after, n_before=0,
-    )  # fmt: skip
+    given = {
+        "x_nm": 0.0, "y_nm": 0.0, "z_nm": z_nm, "mass_kda": mass_kda, "focus_nm": focus_nm,
+        "photons_per_pixel": photons_per_pixel, "n_after": n_after, "n_before": 0,
+    }  # fmt: skip
+    setups = _Setups(config, 2, given)
     joint = truth_in("joint", joint)
     free = FREE_PARAMETERS[mode]
     index = [PARAMETERS.index(name) for name in free]
@@ -294,12 +300,8 @@ def qcrb(
     out = np.full((len(free), *setups.shape), np.nan)
     for place in np.ndindex(setups.shape):
         at = setups.at(place)
-        information = quantum_information(at.model, float(at.theta[2])).real[np.ix_(index, index)]
-        scale = 1 / np.sqrt(np.diag(information))
-        bound = scale
-        if joint:
-            inverse = np.linalg.inv(information * np.outer(scale, scale))
-            bound = scale * np.sqrt(np.diag(inverse))
+        information = quantum_information(at.model, float(at.theta[2]))[np.ix_(index, index)]
+        bound = quantum_bounds(information)[joint]
         # photons are as a², and the information is of ln a: that of the mass is finite at a = 0
         amplitude = abs(float(at.theta[3]))
         shift = 1 / amplitude if amplitude else np.nan
@@ -329,40 +331,22 @@ class _At:
 class _Setups:
     """Broadcast set-ups; models are shared between those of one focus."""
 
-    def __init__(
-        self,
-        config: Config,
-        pixels: int,
-        *,
-        x_nm: ArrayLike,
-        y_nm: ArrayLike,
-        z_nm: ArrayLike | None,
-        mass_kda: ArrayLike | None,
-        focus_nm: ArrayLike | None,
-        photons_per_pixel: ArrayLike,
-        n_after: ArrayLike,
-        n_before: ArrayLike,
-    ) -> None:
+    def __init__(self, config: Config, pixels: int, given: Mapping[str, ArrayLike | None]) -> None:
         self._config = config
         self._pixel_nm = float(config.camera.pixel_size_nm or 0.0)
         self.grid = PixelGrid.centred(pixels, self._pixel_nm)
-        self._dark = config.optics.scheme == "darkfield"
+        self._dark = not config.optics.interferes
         # a calibration was measured at the focus of `optics`, not at the focus of the set-up
         nominal = forward_model(config, self._pixel_nm)
         self._scale = nominal.scale
-        self._all = together(
-            {
-                "x_nm": x_nm,
-                "y_nm": y_nm,
-                "z_nm": config.particle.nominal_height_nm if z_nm is None else z_nm,
-                "mass_kda": nominal.material.mass_kda if mass_kda is None else mass_kda,
-                "focus_nm": config.optics.focus_nm if focus_nm is None else focus_nm,
-                "photons_per_pixel": photons_per_pixel,
-                "n_after": n_after,
-                "n_before": n_before,
-            },
-            least={"z_nm": 0.0, "photons_per_pixel": 0.0, "n_after": 1.0, "n_before": 0.0},
-        )
+        usual = {
+            "z_nm": config.particle.nominal_height_nm,
+            "mass_kda": nominal.material.mass_kda,
+            "focus_nm": config.optics.focus_nm,
+        }
+        whole = {k: usual[k] if value is None else value for k, value in given.items()}
+        least = {"z_nm": 0.0, "photons_per_pixel": 0.0, "n_after": 1.0, "n_before": 0.0}
+        self._all = together(whole, least=least)
         for name in ("n_after", "n_before"):
             broken = self._all[name] != np.round(self._all[name])
             if broken.any():
@@ -387,7 +371,7 @@ class _Setups:
         self._reach_nm = math.hypot(*far) * 1.0001
         highest = float(self._all["z_nm"].max(initial=0.0))
         self._highest_nm = max(highest, config.particle.nominal_height_nm)
-        self._models: dict[float, ForwardModel] = {}
+        self._model = memoize(_FOCI_KEPT, self._at_focus)
 
     def at(self, place: tuple[int, ...]) -> _At:
         """Give the set-up at an index."""
@@ -404,10 +388,8 @@ class _Setups:
         light = now["n_after"] * scale_e * area
         return _At(model, theta, level_e, scale_e, now["n_before"], now["n_after"], light)
 
-    def _model(self, focus_nm: float) -> ForwardModel:
-        if focus_nm not in self._models:
-            optics = self._config.optics.model_copy(update={"focus_nm": focus_nm})
-            config = self._config.model_copy(update={"optics": optics, "calibration": None})
-            model = forward_model(config, self._reach_nm, z_max_nm=self._highest_nm)
-            self._models[focus_nm] = replace(model, scale=self._scale)
-        return self._models[focus_nm]
+    def _at_focus(self, focus_nm: float) -> ForwardModel:
+        optics = self._config.optics.model_copy(update={"focus_nm": focus_nm})
+        config = self._config.model_copy(update={"optics": optics, "calibration": None})
+        model = forward_model(config, self._reach_nm, z_max_nm=self._highest_nm)
+        return replace(model, scale=self._scale)

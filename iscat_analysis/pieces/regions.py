@@ -48,7 +48,8 @@ FALSE_ALARMS_PER_REGION = 0.01
 others are ``not_detected``."""
 
 _LEAST_USABLE_SHARE = 0.5  # share of a region's pixels that must be usable
-_EDGE_SHARE = 0.15  # of the region's side at each edge, where a particle is not looked for
+EDGE_SHARE = 0.15
+"""Share of the region's side at each edge where a particle is not looked for."""
 
 
 def fit_rois(
@@ -167,7 +168,7 @@ def fit_rois(
         optics, particle, camera, mode=mode, z_range_nm=z_range_nm, calibration=calibration
     )
     refuse_rod(config, "its direction has to be fitted too")
-    if mode == "track":
+    if config.fit.follows_tracks:
         raise ConfigError('mode = "track" links frames: give "joint", frame by frame')
     counts = gather(
         config, before, after, contrast=contrast, sigma=sigma, n_before=n_before, n_after=n_after,
@@ -184,7 +185,7 @@ def fit_rois(
     with threads(n_threads) as pool:
         rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
     table = make_rows(rows, {"event": range(count)})
-    if mode == "size":
+    if config.fit.kind.fits_sizes:
         table = with_diameters(table, config.particle.density)
     refused = bool(counts.model.scale.refusal)
     return flagged(table, Status.UNCALIBRATED_OPTICS) if refused else table
@@ -368,7 +369,7 @@ def _start(likelihood: Likelihood, templates: Templates, *, level: bool) -> Cand
     ranked = np.abs(snr) if templates.two_sided else snr
     rows, columns = likelihood.grid.shape
     inner = np.full(ranked.shape, -np.inf)
-    top, left = (int(_EDGE_SHARE * size) for size in (rows, columns))
+    top, left = (int(EDGE_SHARE * size) for size in (rows, columns))
     inside = (slice(None), slice(top, rows - top), slice(left, columns - left))
     inner[inside] = ranked[inside]
     k, row, column = (int(i) for i in np.unravel_index(np.argmax(inner), inner.shape))
@@ -598,7 +599,7 @@ def log_likelihood(
         optics, particle, camera, mode=mode, z_range_nm=z_range_nm, calibration=calibration
     )
     refuse_rod(config, "the angles are no parameters of log_likelihood")
-    if mode == "track":
+    if config.fit.follows_tracks:
         raise ConfigError('mode = "track" links frames: give "joint", frame by frame')
     image, known = real_array("after", after), real_array("before", before)
     if image.ndim != 2:

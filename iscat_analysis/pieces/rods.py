@@ -23,13 +23,12 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.fit import POOR_FIT_P, ModelFit, fit_model, goodness_of_fit
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.models import TurningRod
+from iscat_analysis.inference.sizes import AMBIGUITY_ODDS
 from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.optics.scatterers import Rod, rod_of
 from iscat_analysis.pieces.counts import config_of, gather
+from iscat_analysis.pieces.regions import EDGE_SHARE
 from iscat_analysis.records import Box, FloatArray, Status, verdict
-
-AMBIGUITY_ODDS = 1e-3
-"""Likelihood of another direction, over that of the best, above which the row is flagged."""
 
 WIDE_DEG = 5.0
 """Error of the direction above which it is flagged as well: it is no longer normal."""
@@ -146,7 +145,7 @@ def _row(likelihood: Likelihood, found: list[ModelFit], rod: Rod) -> dict[str, A
     if p_value < POOR_FIT_P:
         flags.append(Status.POOR_FIT)
     wide = max(best.sigma[TILT], best.sigma[AZIMUTH] * math.sin(math.radians(best.theta[TILT])))
-    if odds > AMBIGUITY_ODDS or not wide < WIDE_DEG:
+    if odds > 1 / AMBIGUITY_ODDS or not wide < WIDE_DEG:
         flags.append(Status.AMBIGUOUS_DIRECTION)
     values = {name: float(best.theta[k]) for name, k in _NAMES.items()}
     sigmas = {f"sigma_{name}": float(best.sigma[k]) for name, k in _NAMES.items()}
@@ -169,7 +168,6 @@ _ASIDE_DEG = 20.0  # their first azimuth; across the polarisation, the tilt has 
 _SAME_DEG = 3.0  # between two directions that are one maximum, found twice
 _SAME_VALUE = 0.1  # of their log-likelihoods
 _LARGEST, _LEAST_SHARE = 100.0, 1e-3  # amplitude over that of the nominal mass
-_EDGE_SHARE = 0.15  # of the region's side at each edge, where no fit begins
 
 
 def find_directions(
@@ -235,7 +233,7 @@ def _start(
     odd = PixelGrid.centred(min(grid.shape) // 2 * 2 - 1, grid.pixel_nm)
     picture = model.amplitude_image(odd, 0.0, 0.0, z_nm, model.nominal_amplitude)
     matched = correlate(np.nan_to_num(likelihood.measured_signal()), picture, mode="constant")
-    margin = [int(_EDGE_SHARE * size) for size in grid.shape]
+    margin = [int(EDGE_SHARE * size) for size in grid.shape]
     inside = tuple(slice(m, size - m) for m, size in zip(margin, grid.shape, strict=True))
     row, column = np.unravel_index(np.argmax(matched[inside]), matched[inside].shape)
     share = max(float(matched[inside][row, column] / np.sum(picture**2)), _LEAST_SHARE)

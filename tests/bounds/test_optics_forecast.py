@@ -70,7 +70,7 @@ def test_what_is_not_told_is_named() -> None:
     for name, row in rows.iterrows():
         assert row["determined"] == (row["sigma"] < 0.5 * row["usual_error"])
         assert row["determined"] != any(line.startswith(name) for line in found.unidentifiable)
-    assert any("signal-to-noise" in line for line in found.warnings)
+    assert [each.code for each in found.findings] == ["faint-pictures"]
 
 
 def test_a_fit_of_pictures_has_the_errors_that_were_foreseen() -> None:

@@ -14,12 +14,12 @@ from iscat_analysis.bounds import (
     budget,
     changed,
     effort,
+    findings_of,
     optimize,
     parse_scan,
     parse_target,
     plan,
     scan,
-    warnings_of,
 )
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
@@ -237,12 +237,12 @@ def test_an_unidentifiable_target_is_refused() -> None:
 
 def test_saturation_and_coarse_sampling_are_said() -> None:
     full = plan(protein(camera={"well_depth_e": 9000.0}))
-    assert any("well_depth_e" in line for line in warnings_of(full))
+    assert [each.code for each in findings_of(full)] == ["saturated-plan"]
     coarse = plan(
         protein(camera={"pixel_size_nm": 800.0, "samples_per_pixel": 1}, bounds={"pixels": 5})
     )
-    assert any('samples_per_pixel = "auto"' in line for line in warnings_of(coarse))
-    assert warnings_of(plan(protein())) == []
+    assert "coarse-sampling" in [each.code for each in findings_of(coarse)]
+    assert findings_of(plan(protein())) == []
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,9 @@ from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.config import Config
 from iscat_analysis.inference import counts as noise
-from iscat_analysis.inference.fit import AMBIGUITY_ODDS, fit_particle, search_box
+from iscat_analysis.inference.fit import fit_particle, search_box
 from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.sizes import AMBIGUITY_ODDS
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import (
     FREE_PARAMETERS,
