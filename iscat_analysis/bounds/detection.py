@@ -25,9 +25,6 @@ from scipy.special import ndtr, ndtri
 from iscat_analysis.bounds.experiment import Experiment, expected_likelihood
 from iscat_analysis.inference.random_field import extent, height_reached
 
-_NO_PARTICLE = 1e-4  # a signal-to-noise ratio that changes nothing, to 1e-8
-_FAINT = 1e-6  # of the particle's amplitude: where derivatives with the place are taken
-
 
 @dataclass(frozen=True)
 class DetectionLimit:
@@ -53,7 +50,8 @@ def power_searched(snr: float, threshold: float) -> float:
     """Probability to detect a particle whose place is fitted."""
     # the length of a normal vector in space whose mean lies snr from the origin
     far, near = threshold + snr, threshold - snr
-    if snr < _NO_PARTICLE:
+    # no particle, to 1e-8
+    if snr < 1e-4:
         rim = 2 * threshold * math.exp(-(threshold**2) / 2)
     else:
         rim = (math.exp(-(near**2) / 2) - math.exp(-(far**2) / 2)) / snr
@@ -66,7 +64,8 @@ def detection_limit(experiment: Experiment) -> DetectionLimit | None:
     if not model.rho:
         return None
     theta = experiment.theta.copy()
-    theta[3] *= _FAINT
+    # a faint particle has derivatives with the place
+    theta[3] *= 1e-6
     read = experiment.config.camera.assumed.read_noise_e
     empty = expected_likelihood(
         model, experiment.grid, theta, at.photons_per_pixel, at.photons_per_pixel,

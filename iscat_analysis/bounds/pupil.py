@@ -76,7 +76,6 @@ NO_BOUND = 50.0
 
 _DIGITS = {"focus_nm": 1, "reference_phase_deg": 1, "mask_na": 3}  # of what is written; others 1
 _UNIT_FOCUS_NM = 500.0
-_WAVES = 20.0  # a unit of a Zernike term is the wavelength over this
 
 
 @dataclass
@@ -200,7 +199,8 @@ class Search:
 
     def _coding(self, key: str) -> tuple[Callable[[float], float], Callable[[float], float]]:
         optics, height = self.config.optics, self.config.particle.nominal_height_nm
-        wave = optics.wavelength_nm / _WAVES
+        # a unit of a Zernike term is a twentieth of the wavelength
+        wave = optics.wavelength_nm / 20.0
         if key == "focus_nm":
             return (lambda v: (v - height) / _UNIT_FOCUS_NM, lambda u: height + _UNIT_FOCUS_NM * u)
         if key == "reference_phase_deg":

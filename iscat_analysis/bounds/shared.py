@@ -181,8 +181,6 @@ MODES = ("mass", "localize", "joint")
 
 _PHASES = 3  # places inside a pixel, per axis, over which particles are spread
 _MANY = 10**6  # events that tell whatever particles of this kind can tell at all
-_Z = 2  # of x, y, z, mass, level: what is given
-_ZERO = 1e-9  # what symmetry makes 0 [nm, kDa]
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +214,8 @@ class OpticsForecast:
             mode: dict(
                 zip(
                     FREE_PARAMETERS[mode],
-                    (float(s) if s > _ZERO else 0.0 for s in shared_sigma(moves, self.covariance)),
+                    # symmetry makes the others 0 [nm, kDa]
+                    (float(s) if s > 1e-9 else 0.0 for s in shared_sigma(moves, self.covariance)),
                     strict=True,
                 )
             )
@@ -363,7 +362,8 @@ class _Picture:
         parts = []
         for likelihood, theta in zip(likelihoods, thetas, strict=True):
             whole = joint_information(likelihood, theta, names)
-            fitted = [i for i in range(count + 5) if i != count + _Z]
+            # of x, y, z, mass, level the height is given
+            fitted = [i for i in range(count + 5) if i != count + 2]
             parts.append(eliminated(whole[np.ix_(fitted, fitted)], count))
         level = config.background.method == "sliding"
         return cls(likelihoods, thetas, names, mass, level, np.asarray(np.mean(parts, axis=0)))

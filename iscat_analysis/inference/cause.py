@@ -61,8 +61,6 @@ _FAR_DARK: Mapping[str, Sequence[float]] = {
 _SCALES = (PIXEL, "wavelength")
 """What stretches pictures: a movie may not tell one from the other."""
 
-_AT_LEAST = 0.03  # of χ² in excess, by which two causes must differ where both are tried whole
-_SIGMAS = 4.0  # standard errors of χ², by which they must too
 
 _OTHERS: Mapping[str, Mapping[str, Any]] = {
     "polarisation, as if circular light passed an analyser": {
@@ -150,7 +148,8 @@ def likely_cause(
     name = max(named, key=lambda name: named[name][0][0])
     share, step = named[name][0]
     pixels = sum(each.rest.size for each in left)
-    margin = max(1 - share, _AT_LEAST) + _SIGMAS * math.sqrt(2 * pixels) / excess
+    # causes that are both tried whole differ by 3 % of χ² in excess, and by 4 standard errors
+    margin = max(1 - share, 0.03) + 4.0 * math.sqrt(2 * pixels) / excess
 
     others = [other for s, other in named[name][1:] if s > share - margin]
     scales = [n for n in _SCALES if n in named and name in _SCALES and n != name]

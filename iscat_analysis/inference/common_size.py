@@ -71,11 +71,6 @@ UNDETERMINED = 0.5
 APART = 1 / 8
 """Share of a fringe by which two heights of a frame differ at least."""
 
-_LEAST_KNOWN = 1e-6  # of what a frame of one height would tell, is told by one of several
-_TURNED = 0.5  # share of a step by which the next goes back, where both go too far
-_GROWTH = 0.2  # largest relative change of the mass in a step, and of n − n_s
-_SHORTER = 1e3  # a damped step is as much shorter, times the damping: half of it at first
-
 
 @dataclass(frozen=True)
 class CommonSize:
@@ -274,16 +269,19 @@ class _Joint:
             left = here.place_score - here.mixed @ step
             moves = np.einsum("bij,bj->bi", here.place_inverse, left)
             if not damping:
-                back = -np.sum(moves * last, axis=1) > _TURNED * np.sum(last**2, axis=1)
+                # the next step goes back by more than half of the last, where both go too far
+                back = -np.sum(moves * last, axis=1) > 0.5 * np.sum(last**2, axis=1)
                 last, shorter = moves, np.where(back, shorter / 2, shorter)
             far = np.abs(moves).max(axis=1) / (0.1 * self.model.optics.wavelength_nm)
             moves = moves * (shorter / np.maximum(far, 1.0))[:, None]
             whole = np.concatenate([step, moves.ravel()])
-            return np.asarray(whole / (1 + _SHORTER * damping), dtype=np.float64)
+            # a damped step is shorter: half of it at first
+            return np.asarray(whole / (1 + 1e3 * damping), dtype=np.float64)
 
         def farthest(theta: FloatArray) -> FloatArray:
             out = np.full(theta.size, math.inf)
-            out[:k] = _GROWTH * np.abs(theta[:k] - [0.0, self.model.optics.n_sample][:k])
+            # largest relative change of the mass in a step, and of n − n_s
+            out[:k] = 0.2 * np.abs(theta[:k] - [0.0, self.model.optics.n_sample][:k])
             return out
 
         lower, upper = np.full((2, k + rows.size), math.inf) * [[-1], [1]]
@@ -371,7 +369,8 @@ def _of_frames(
     np.add.at(mean, owners, shares[:, None] * pulls)
     sizes, axes = np.linalg.eigh(expected - spread + mean[:, :, None] * mean[:, None, :])
     positive = axes * np.maximum(sizes, 0.0)[:, None] @ np.swapaxes(axes, 1, 2)
-    return np.asarray(positive + _LEAST_KNOWN * expected)
+    # a frame of several heights tells a millionth of what one height would, at least
+    return np.asarray(positive + 1e-6 * expected)
 
 
 def _still_likely(
@@ -436,8 +435,6 @@ def _bias(
 
 INDEX = 4
 """Where the index stands in θ, before the level."""
-
-_SAME_LIKELIHOOD = 0.5  # by which a fit may end below the one that it began from
 
 
 class IndexFit(NamedTuple):
@@ -514,7 +511,8 @@ def _is_told(
     model = _model_of(own)
     index, known = model.sphere.index.real, _model_of(likelihood).sphere.index.real
     gain = again.log_likelihood - fit.log_likelihood
-    if Status.AT_BOUND in again.flags or gain < -_SAME_LIKELIHOOD:
+    # a fit may end so much below the one that it began from
+    if Status.AT_BOUND in again.flags or gain < -0.5:
         return False
     errors = [math.sqrt(covariance[INDEX, INDEX]) for covariance in covariances]
     errors.append(abs(index - known) / math.sqrt(max(2 * gain, 1.0)))

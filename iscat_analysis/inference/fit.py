@@ -85,9 +85,6 @@ WAIST = 0.5
 POOLED_COUNTS = 5.0
 """Cells that expect fewer counts are joined until they expect as many."""
 
-_LEAST_VARIANCE_RATIO = 0.1  # variance of a sum of squares over that of normal residuals, at least
-_SUSPECTS = 8  # largest residuals whose exact tail is looked up
-
 AWAY = 3.0
 """Standard deviations from the maximum at which the likelihood is looked at."""
 
@@ -108,14 +105,12 @@ the end of a calibration's line, before the fit is said to be at a bound: fewer 
 AMPLITUDE = 3
 """Index of the amplitude in θ."""
 
-_STARTS = 8  # local maxima of the scan that are followed
-_WINDOW_NM = 350.0  # how far x and y may move from the start
 _NOTHING_KNOWN = np.zeros((5, 5))  # information where nothing was looked at
 
 
 def window_nm(pixel_nm: float) -> float:
     """How far x and y may move from the start of a fit."""
-    return max(_WINDOW_NM, 3 * pixel_nm)
+    return max(350.0, 3 * pixel_nm)
 
 
 def search_box(
@@ -426,7 +421,8 @@ def _heights(likelihood: Likelihood, theta: FloatArray, box: Box) -> list[tuple[
     padded = [-math.inf, *values.tolist(), -math.inf]
     peaks = [i for i in range(len(heights)) if padded[i] <= padded[i + 1] >= padded[i + 2]]
     starts = []
-    for i in sorted(peaks, key=lambda i: -padded[i + 1])[:_STARTS]:
+    # maxima of the scan that are followed
+    for i in sorted(peaks, key=lambda i: -padded[i + 1])[:8]:
         begin = theta.copy()
         begin[2], begin[3] = heights[i], amplitudes[i]
         starts.append((begin, padded[i + 1]))
@@ -533,7 +529,8 @@ def three_tests(
     rows = likelihood.derivatives(theta) if derivatives is None else derivatives
     free = np.asarray(free, dtype=np.bool_)
     optics, grid = likelihood.model.optics, likelihood.grid
-    rate, tails = np.empty(grid.shape), np.empty((3, _SUSPECTS))
+    # exact tails of the eight largest residuals
+    rate, tails = np.empty(grid.shape), np.empty((3, 8))
     chi2, pixels, excess, least_rate, mode_chi2, modes, mode_excess, least, count = count_and_test(
         likelihood.noise.code, likelihood.data, math.exp(theta[LEVEL]), rows, grid.x_nm, grid.y_nm,
         theta, WAIST * optics.wavelength_nm / optics.na, ORDER, free, MANY_COUNTS,
@@ -556,7 +553,8 @@ def three_tests(
 
 def gamma_above(chi2: float, freedom: float, excess: float) -> float:
     """Upper tail of a sum of squares of variance (2 + excess)·freedom."""
-    spread = max(1 + excess / 2, _LEAST_VARIANCE_RATIO)
+    # over the variance of a sum of squares of normal residuals
+    spread = max(1 + excess / 2, 0.1)
     return float(gammaincc(freedom / spread / 2, chi2 / spread / 2))
 
 

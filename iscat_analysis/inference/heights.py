@@ -79,7 +79,6 @@ SIGNIFICANT = 20.0
 """Twice the gain in log-likelihood by which a spread is told from none; by chance in 1e-5."""
 
 _FINEST_NM, _WIDEST_NM, _WIDTHS = 0.05, 300.0, 240  # spreads that are tried
-_OUTLIER_SIGMAS = 4.0  # of the robust spread, beyond which an event is one of another optimum
 _IN_95 = 3.84  # twice the fall of the log-likelihood at the ends of a 95 % interval
 
 
@@ -126,7 +125,8 @@ def spread_of_heights(z_nm: FloatArray, sigma_nm: FloatArray) -> HeightSpread | 
     z, v = z_nm[known], sigma_nm[known] ** 2
     if z.size >= FEWEST:
         away = np.abs(z - np.median(z))
-        kept = away <= _OUTLIER_SIGMAS * np.sqrt((SIGMA_PER_MAD * np.median(away)) ** 2 + v)
+        # an event farther away is one of another optimum
+        kept = away <= 4.0 * np.sqrt((SIGMA_PER_MAD * np.median(away)) ** 2 + v)
         z, v = z[kept], v[kept]
     if z.size < FEWEST:
         return None

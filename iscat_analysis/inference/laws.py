@@ -28,7 +28,6 @@ from iscat_analysis.records import BoolArray, FloatArray
 MANY_COUNTS = 1e6
 """Counts above which tails are normal: 5 σ out to a few per cent."""
 
-_LEAST_TAIL = 1e-11  # tail below which whole counts are not distinguished from continuous ones
 _CERTAIN = 1 - 1e-16
 
 
@@ -249,7 +248,8 @@ def law_named(name: str) -> NoiseLaw:
 def attainable_tails(rate: FloatArray, tail: float) -> FloatArray:
     """Probability that a Poisson count has a two-sided tail of at most `tail`, for each rate."""
     half = tail / 2
-    if half < _LEAST_TAIL or half >= 0.5:
+    # below it whole counts are not distinguished from continuous ones
+    if half < 1e-11 or half >= 0.5:
         return np.full(rate.size, min(tail, 1.0))
     out = np.full(rate.size, tail)
     few = rate < MANY_COUNTS

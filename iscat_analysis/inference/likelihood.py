@@ -51,7 +51,6 @@ LEVEL = 4
 LARGEST_LEVEL = 50.0
 """Logarithm of the level beyond which no light is meant, and counts would overflow."""
 
-_MOST_PICTURED = 128  # pixels along an axis; the table of a larger picture would not be worth it
 _LEVEL = Parameter("log_level", limits=(-LARGEST_LEVEL, LARGEST_LEVEL), step=1.0)
 
 
@@ -381,7 +380,8 @@ class Likelihood(ModelLikelihood):
         One serves all particles at that height; others are met once.
         """
         model, grid = self.model, self.grid
-        if z_nm != model.height_nm or max(grid.shape) > _MOST_PICTURED or model.is_measured:
+        # the table of a picture of more than 128 pixels along an axis would not be worth it
+        if z_nm != model.height_nm or max(grid.shape) > 128 or model.is_measured:
             return False
         far_x = max(upper[0] - grid.x_nm[0], grid.x_nm[-1] - lower[0])
         far_y = max(upper[1] - grid.y_nm[0], grid.y_nm[-1] - lower[1])

@@ -28,9 +28,6 @@ FARTHEST_HALF_NM = 250.0
 INDEX_STEP = 1e-4
 """Of differences along the refractive index; their error is 1e-6 of the derivative."""
 
-_ANGLE_STEP_DEG = 20.0  # largest step of an angle
-_HALF_STEP_NM = 60.0  # largest step of a half of a pair
-
 
 class ParticleModel(Protocol):
     """What likelihood, fit, posterior and bounds ask of a particle."""
@@ -53,7 +50,7 @@ class TurningRod:
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         """Those of a dipole, and both angles."""
-        angles = (Parameter(name, "degrees", step=_ANGLE_STEP_DEG) for name in ANGLES)
+        angles = (Parameter(name, "degrees", step=20.0) for name in ANGLES)
         return (*self.model.parameters, *angles)
 
     def turned(self, azimuth_deg: float, tilt_deg: float) -> ForwardModel:
@@ -86,7 +83,7 @@ class Halves:
     def parameters(self) -> tuple[Parameter, ...]:
         """Those of a point, and h along x and y."""
         limits = (-FARTHEST_HALF_NM, FARTHEST_HALF_NM)
-        halves = (Parameter(f"half_{axis}_nm", "nm", limits, _HALF_STEP_NM) for axis in "xy")
+        halves = (Parameter(f"half_{axis}_nm", "nm", limits, 60.0) for axis in "xy")
         return (*self.model.parameters, *halves)
 
     def rows(self, grid: PixelGrid, values: Values) -> tuple[FloatArray, FloatArray]:

@@ -154,9 +154,6 @@ _DEPENDENT = 1e-6
 """Share of a direction's information that is left, below which the fit has it already."""
 
 
-_SHORTEST_NM = 20.0  # at which the fit starts: at 0 the derivative along h vanishes
-
-
 class Pair(NamedTuple):
     """The fit of two halves, in columns of ``fits.csv``.
 
@@ -193,7 +190,8 @@ def pair_of(likelihood: Likelihood, fit: FitResult, evidence: Evidence) -> Pair:
     if not np.isfinite(covariance_nm2).all():
         return Pair()
     size, direction = np.linalg.eigh(covariance_nm2)
-    half = direction[:, -1] * max(math.sqrt(max(size[-1], 0.0)), _SHORTEST_NM)
+    # the fit starts at 20 nm at least: at 0 the derivative along h vanishes
+    half = direction[:, -1] * max(math.sqrt(max(size[-1], 0.0)), 20.0)
     half *= min(1.0, 0.8 * FARTHEST_HALF_NM / math.hypot(*half))
     halves, far = Halves(likelihood.model), np.full(2, FARTHEST_HALF_NM)
     free = np.insert(fit.box.free, LEVEL, [True, True])

@@ -46,10 +46,8 @@ MISSED_SHARE = 0.05
 LEFT_SHARE = 0.1
 """Share of the dipole's excess of χ² that a sphere may have if it does not describe all."""
 
-_FOLLOWED = 3  # maxima of the likelihood over the diameter, of each material
 _STRENGTHS = np.geomspace(0.007, 0.25, 10)  # light per volume of a sphere whose index is fitted
 _REACHES_NM = (900.0, 700.0, 600.0, 500.0)  # around an image's centre, which each improves
-_BESIDE_NM = 100.0  # from it, within which a dipole is in the middle
 
 
 class _Sphere(NamedTuple):
@@ -198,7 +196,8 @@ def _centred(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
         )
     moved = theta.copy()
     moved[:2] = x, y
-    beside = math.hypot(x - theta[0], y - theta[1]) > _BESIDE_NM
+    # nearer to the centre a dipole is in the middle
+    beside = math.hypot(x - theta[0], y - theta[1]) > 100.0
     return moved if beside and _is_in_reach(likelihood, moved) else theta
 
 
@@ -232,7 +231,8 @@ def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool)
             signal = linear.amplitude_image(seated.grid, x, y, 0.0, strength / own * mass)
             values[i, j] = seated.noise.terms(seated.data, signal, g).value
     optima: list[_Sphere] = []
-    for i, j in highest_maxima(values, _FOLLOWED):
+    # maxima of the likelihood over the diameter, of each material
+    for i, j in highest_maxima(values, 3):
         if values[i, j] <= 0:
             break
         begin = np.array([x, y, 0.0, masses[i], g])

@@ -199,7 +199,6 @@ LEAST_EXCESS = 0.02
 
 # Growth of the excess from half a window to a whole one, above which it is a drift
 _LEAST_DRIFT_GROWTH = 4.0
-_MOST_HALF_WIDTH = 5.0  # half-width of an interval of ln ratio, beyond which nothing is known
 _FEWEST_TILES = 6
 _FEWEST_COUNTS = 200
 
@@ -287,7 +286,8 @@ def pooled(
     ratio2 = max(found.ratio2, 1e-6)
     error = math.sqrt(found.variance) / (2 * ratio2)  # of ln ratio
     ratio, degrees = math.sqrt(ratio2), max(found.degrees, 2)
-    reach = min(float(stdtrit(degrees, 0.975)) * error, _MOST_HALF_WIDTH)
+    # half-width of an interval of ln ratio, beyond which nothing is known
+    reach = min(float(stdtrit(degrees, 0.975)) * error, 5.0)
     # what Student's law makes of the error, in normal standard errors
     chance = float(stdtr(degrees, -abs(math.log(ratio)) / error))
     significance = math.copysign(-float(ndtri(max(chance, 1e-300))), math.log(ratio))

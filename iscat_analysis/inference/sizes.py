@@ -44,8 +44,6 @@ OTHER_SIZE = 3.0
 OTHER_SIZE_SHARE = 0.02
 """Share of the mass by which two maxima at one height differ at least."""
 
-_FOLLOWED = 6  # local maxima that are followed
-
 
 def size_starts(
     likelihood: Likelihood, model: SizedModel, theta: FloatArray, box: Box
@@ -55,7 +53,8 @@ def size_starts(
     heights = scanned_heights(model, float(box.lower[2]), float(box.upper[2]))
     values = scan_sizes(likelihood, model, theta, masses, heights)
     starts = []
-    for i, j in highest_maxima(values, _FOLLOWED, diagonal=True):
+    # local maxima that are followed
+    for i, j in highest_maxima(values, 6, diagonal=True):
         begin = theta.copy()
         begin[2], begin[3] = heights[j], masses[i]
         starts.append(begin)

@@ -60,8 +60,6 @@ focus the peak lies on a ring, and the mass scale must not depend on the size of
 DONG2021_FIELD_NODES = 110
 """Nodes of the rectangle rule in D21's program for fields."""
 
-_STANDARDS_KEPT = 16  # cached optics of standards, with their contrast per kDa
-
 
 def forward_model(
     config: Config, reach_nm: float, *, z_max_nm: float | None = None, nodes: int | None = None
@@ -268,4 +266,5 @@ def _standards_peak_terms(optics: str, particle: str) -> tuple[float, float]:
     )
 
 
-_peak_of_standards = memoize(_STANDARDS_KEPT, _standards_peak_terms)
+# optics of standards, with their contrast per kDa
+_peak_of_standards = memoize(16, _standards_peak_terms)

@@ -67,7 +67,6 @@ Values = Sequence[float] | FloatArray
 """Values of the parameters of a particle model."""
 
 _TABLES_KEPT = 4  # cached heights with their derivatives or tables, some MB each
-_LARGEST_GROWTH = 0.5  # largest relative change of a mass in one step of a fit
 
 
 @dataclass(frozen=True)
@@ -140,7 +139,7 @@ class ForwardModel:
         return (
             *(Parameter(name, "nm", step=wavelength / 4) for name in ("x_nm", "y_nm")),
             Parameter("z_nm", "nm", self.z_range_nm, wavelength / 10),
-            Parameter("mass_kda", "kDa", growth=_LARGEST_GROWTH, scale=self.scale),
+            Parameter("mass_kda", "kDa", growth=0.5, scale=self.scale),
         )
 
     def at(self, amplitude: float) -> ForwardModel:
@@ -393,9 +392,6 @@ class ForwardModel:
         return self.lens, self.pixels(grid), x_nm, y_nm, amplitude
 
 
-_AZIMUTHS = 8  # the light of a dipole is a trigonometric polynomial of order 4
-
-
 def collected_area_nm2(model: ForwardModel, z_nm: float, mass_kda: float) -> float:
     """Scattered light that the pupil collects, as an equivalent area of reference.
 
@@ -406,7 +402,8 @@ def collected_area_nm2(model: ForwardModel, z_nm: float, mass_kda: float) -> flo
         return math.nan
     amplitude = model.scale.amplitude(mass_kda)
     opening = model.at(amplitude).aperture
-    p, phi = opening.pupil, np.linspace(0.0, 2 * math.pi, _AZIMUTHS, endpoint=False)
+    # the light of a dipole is a trigonometric polynomial of order 4: 8 azimuths
+    p, phi = opening.pupil, np.linspace(0.0, 2 * math.pi, 8, endpoint=False)
     decay = np.exp(-2 * p.axial.imag * model.centre_nm(z_nm, amplitude))
     density = (np.abs(opening.polarised(phi)) ** 2).sum(0).mean(1) * np.sin(p.theta) * decay
     pupil_integral = 2 * math.pi * float(np.sum(p.weight * density))

@@ -114,7 +114,6 @@ MASK_NA = 0.02
 """Smallest mask, and the narrowest ring around it."""
 
 _LOWEST_NA = 0.3
-_NA_ROOM = 2e-3  # below the index of the oil
 
 
 def free_groups(text: str | Sequence[str] | None) -> tuple[str, ...]:
@@ -169,7 +168,8 @@ def change_of(before: Settings, after: Settings, names: Sequence[str]) -> FloatA
 
 def optics_limits(n_immersion: float, n_glass: float) -> dict[str, tuple[float, float]]:
     """Bounds of the parameters of a microscope that can exist."""
-    top = min(n_immersion, n_glass) - _NA_ROOM
+    # a little below the index of the oil
+    top = min(n_immersion, n_glass) - 2e-3
     return {
         "na": (_LOWEST_NA, top),
         "mask_na": (MASK_NA, top - MASK_NA),
@@ -210,9 +210,6 @@ _SOME_MASK = {"mask_na": (0.65, 0.25), "attenuation": (0.4, 0.3)}
 
 _DIM_SHARE = 0.2
 """Largest usual error of a mask's transmission, over it: contrasts are as its inverse."""
-
-_TOLD = 0.5  # of the standard deviation before, to which pictures that tell a parameter bring it
-_PLAUSIBLE = 7.0  # usual errors
 
 
 @dataclass(frozen=True)
@@ -262,9 +259,11 @@ def are_told(sigma: FloatArray, before: FloatArray) -> BoolArray:
 
     Shapes: `sigma, before`, result (n,).
     """
-    return np.asarray(sigma < _TOLD * before)
+    # pictures that tell a parameter halve its standard deviation
+    return np.asarray(sigma < 0.5 * before)
 
 
 def is_usual(name: str, size: float) -> bool:
     """Tell whether a parameter may change by so much."""
-    return abs(size) < _PLAUSIBLE * PARAMETERS[name].usual_error
+    # in usual errors
+    return abs(size) < 7.0 * PARAMETERS[name].usual_error

@@ -23,8 +23,6 @@ TOLERANCE = 2.5e-4
 to this part of their peak, and masses too."""
 
 _LARGEST_NA = 1.5  # of most objectives; points do not move where optics are learned
-_ZERO_ERROR = 0.9  # of the band: the error vanishes there, and is about even below and above
-_NEWTON = 8  # steps to this point
 _WAVES = np.linspace(0.0, 1.0, 101)  # of the band, on which the error is judged
 
 
@@ -130,9 +128,11 @@ def _fewest(phase: float) -> tuple[FloatArray, FloatArray]:
     """
     for count in itertools.count(1):  # pragma: no branch
         places, weights = np.polynomial.legendre.leggauss(count)
-        weights, at = weights / 2, _ZERO_ERROR * phase
+        # the error vanishes at 0.9 of the band, and is about even below and above
+        weights, at = weights / 2, 0.9 * phase
         factor = 1.0
-        for _ in range(_NEWTON if count > 1 else 0):
+        # Newton's steps to this point
+        for _ in range(8 if count > 1 else 0):
             turn = factor * at * places
             error = float(weights @ np.cos(turn)) - float(np.sinc(at / math.pi))
             factor += error / float(weights @ (np.sin(turn) * at * places))

@@ -149,9 +149,6 @@ Coefficients = tuple[ComplexArray, ComplexArray]
 SMALLEST_NM = 0.2
 """Diameter below which every sphere has the pattern of this one, a dipole to 1e-5 at most."""
 
-_MORE_ORDERS = 4  # than the usual number: evanescent waves need some more
-_KEPT = 512  # coefficients of spheres
-
 
 @dataclass(frozen=True)
 class Sphere:
@@ -264,7 +261,8 @@ def amplitudes(orders: Coefficients, mu: ComplexArray) -> tuple[ComplexArray, Co
 
 def _coefficients(x: float, core: float, m: complex, shell: float) -> Coefficients:
     """Compute Mie's coefficients for the size x, that of the core, and the indices of both."""
-    count = int(x + 4.05 * x ** (1 / 3) + 2) + _MORE_ORDERS
+    # four more than the usual number, for evanescent waves
+    count = int(x + 4.05 * x ** (1 / 3) + 2) + 4
     if not shell:
         from miepython import an_bn
 
@@ -283,14 +281,12 @@ def _coefficients(x: float, core: float, m: complex, shell: float) -> Coefficien
     return np.ravel(a), np.ravel(b)
 
 
-coefficients = memoize(_KEPT, _coefficients)
+coefficients = memoize(512, _coefficients)
 """Mie's coefficients a_n and b_n; the last ones are kept."""
 
 
 ANGLES = ("azimuth_deg", "tilt_deg")
 """Names of the angles of a rod."""
-
-_NEARLY_ROUND = 1e-4  # e² below which the series of L is exact to rounding
 
 
 @dataclass(frozen=True)
@@ -348,7 +344,8 @@ def rod_of(particle: Particle, permittivity: complex, n_sample: float) -> Rod | 
 def depolarisation(aspect_ratio: float) -> float:
     """Give the depolarisation factor along the axis of a prolate spheroid."""
     square = 1 - aspect_ratio**-2
-    if square < _NEARLY_ROUND:
+    # the series is exact to rounding
+    if square < 1e-4:
         return (1 - square) * (1 / 3 + square / 5 + square**2 / 7 + square**3 / 9)
     eccentricity = math.sqrt(square)
     return (1 - square) / square * (math.atanh(eccentricity) / eccentricity - 1)

@@ -45,9 +45,6 @@ ComplexArray = NDArray[np.complex128]
 MASS_STEP = 5e-4
 """Relative step of the mass in differences, a 6000th of the diameter."""
 
-_MASSES_KEPT = 48  # models of single masses at hand
-_INDICES_KEPT = 6
-_SCANNED_KEPT = 64  # the same of a scan, with tables along z of some MB each
 _SECOND = {pair: 5 + k for k, pair in enumerate(PAIRS)}  # rows of second derivatives
 
 
@@ -86,15 +83,17 @@ class SizedModel(ForwardModel):
         def make(index: float) -> SizedModel:
             return replace(self, sphere=replace(self.sphere, index=complex(index)))
 
-        return memoize(_INDICES_KEPT, make)
+        return memoize(6, make)
 
     @cached_property
     def _of_mass(self) -> Callable[[Sphere], ForwardModel]:
-        return memoize(_MASSES_KEPT, self._linear)
+        # single masses at hand
+        return memoize(48, self._linear)
 
     @cached_property
     def _of_scan(self) -> Callable[[Sphere], ForwardModel]:
-        return memoize(_SCANNED_KEPT, self._linear)
+        # masses of a scan, with tables along z of some MB each
+        return memoize(64, self._linear)
 
     def _linear(self, sphere: Sphere) -> ForwardModel:
         """Make the model of the pattern of one sphere."""
@@ -204,7 +203,6 @@ BILAYER_NM, BILAYER_INDEX = 5.0, 1.46
 """Shell of a vesicle that is filled with the sample's medium: a bilayer of lipids."""
 
 _MOST_STRENGTH = 0.9  # an index of five times the sample's
-_THINNEST_CORE = 1.1  # diameter of the smallest vesicle over twice its shell
 
 
 def largest_dipole_nm(optics: Optics) -> float:
@@ -287,7 +285,8 @@ def seated_models(
         indices = (sphere.index.real,) * 2
         if kind == SPHERE:
             indices = optics.n_sample + LEAST_CONTRAST, LARGEST_INDEX
-        low = max(diameters_nm[0], SMALLEST_NM, 2 * _THINNEST_CORE * sphere.shell_nm)
+        # the smallest vesicle is 1.1 times as wide as twice its shell
+        low = max(diameters_nm[0], SMALLEST_NM, 2 * 1.1 * sphere.shell_nm)
         if not sphere.index.imag:  # a smaller one that does not absorb is a dipole like a protein
             low = max(low, largest_dipole_nm(optics))
         if low >= diameters_nm[1]:

@@ -37,9 +37,6 @@ RINGS = 1.6
 """The same, far from the particle: the relative error of the rings of the interference is 1e-3, and
 the square of the scattered field is negligible."""
 
-_OUTER_WEIGHT = 1e-3  # weight of the band from there to twice that, where there is little light
-_POINTS = 24  # of the quadrature over each band
-
 
 def samples_per_pixel(optics: Optics, pixel_nm: float, band: float = BAND) -> int:
     """Give how many samples per pixel the image needs along each axis."""
@@ -92,9 +89,11 @@ def weights_between(variance: float, band: float = BAND) -> FloatArray:
 
     Shapes: result (degree + 1, TAPS).
     """
-    points, quadrature = np.polynomial.legendre.leggauss(_POINTS)
+    # of the quadrature over each band
+    points, quadrature = np.polynomial.legendre.leggauss(24)
     u = band * np.concatenate([(points + 1) / 2, (points + 3) / 2])
-    root = np.sqrt(np.concatenate([quadrature, _OUTER_WEIGHT**2 * quadrature]))
+    # beyond the band, to twice its end, there is little light
+    root = np.sqrt(np.concatenate([quadrature, 1e-3**2 * quadrature]))
     waves = np.exp(1j * np.outer(u, np.arange(TAPS) - (TAPS // 2 - 1))) * root[:, None]
     t = (1 - np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))) / 2
     wanted = np.exp(1j * np.outer(u, t) - variance * u[:, None] ** 2 / 2) * root[:, None]

@@ -70,7 +70,6 @@ TABLE_LIMIT_MB = 400
 _HEIGHTS_KEPT = 8  # cached profiles; if z is fixed, every image needs the same one
 _PEAK_STEP = 1 / 3  # of the lattice: the grid on which the largest signal is searched
 _PEAK_POINTS = 8  # the same, in each step of the radial table
-_NEWTON = 4  # steps from there
 _HEIGHTS_AT_ONCE = 16  # heights of the axial table made together
 # Bessel matrices: models that differ in focus or phase need the same ones
 _TABLES: LastUsed[FloatArray] = LastUsed(16_000_000)
@@ -305,7 +304,8 @@ class LatticeField:
         point, one = np.zeros(1), np.ones(1)
         out = np.empty((1, ROWS, 1))
         if 0 < row < grid.y.size - 1 and 0 < column < grid.x.size - 1:
-            for _ in range(_NEWTON):
+            # Newton's steps
+            for _ in range(4):
                 pixels = Pixels(np.array([x]), np.array([y]), point, one)
                 signal_hessian(profile, lens, pixels, 0.0, 0.0, amplitude, out)
                 # the particle's derivatives: those of the camera's position with the sign changed

@@ -27,8 +27,6 @@ from iscat_analysis.optics.scatterers import ANGLES, Rod
 from iscat_analysis.pieces.counts import LARGEST_REGION, config_of, darkfield_photons, together
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
 
-_FOCI_KEPT = 64  # models of single foci
-
 
 def psf(
     optics: Optics,
@@ -371,7 +369,7 @@ class _Setups:
         self._reach_nm = math.hypot(*far) * 1.0001
         highest = float(self._all["z_nm"].max(initial=0.0))
         self._highest_nm = max(highest, config.particle.nominal_height_nm)
-        self._model = memoize(_FOCI_KEPT, self._at_focus)
+        self._model = memoize(64, self._at_focus)
 
     def at(self, place: tuple[int, ...]) -> _At:
         """Give the set-up at an index."""

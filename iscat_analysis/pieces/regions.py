@@ -47,7 +47,6 @@ FALSE_ALARMS_PER_REGION = 0.01
 """Share of regions without a particle in which the highest peak of the noise is taken for one; the
 others are ``not_detected``."""
 
-_LEAST_USABLE_SHARE = 0.5  # share of a region's pixels that must be usable
 EDGE_SHARE = 0.15
 """Share of the region's side at each edge where a particle is not looked for."""
 
@@ -304,7 +303,8 @@ def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -
     likelihood = counts.likelihood(index)
     config, model, pixel_nm = counts.config, counts.model, counts.grid.pixel_nm
     saturated = counts.saturated[index]
-    if likelihood.n_pixels < _LEAST_USABLE_SHARE * saturated.size:
+    # half of the pixels must be usable
+    if likelihood.n_pixels < 0.5 * saturated.size:
         flags = [Status.NOT_CONVERGED, *([Status.SATURATED] if saturated.any() else [])]
         status, noticed = verdict(flags)
         return {

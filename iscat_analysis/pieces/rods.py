@@ -164,9 +164,6 @@ def _row(likelihood: Likelihood, found: list[ModelFit], rod: Rod) -> dict[str, A
 
 
 _RINGS = ((25.0, 4), (60.0, 6), (90.0, 4))  # tilts, and azimuths of each, where fits begin
-_ASIDE_DEG = 20.0  # their first azimuth; across the polarisation, the tilt has no slope
-_SAME_DEG = 3.0  # between two directions that are one maximum, found twice
-_SAME_VALUE = 0.1  # of their log-likelihoods
 _LARGEST, _LEAST_SHARE = 100.0, 1e-3  # amplitude over that of the nominal mass
 
 
@@ -182,7 +179,8 @@ def find_directions(
     free = np.array([True, True, False, True, True, True, level])
     reach = likelihood.model.optics.wavelength_nm / 2
     largest = _LARGEST * likelihood.model.nominal_amplitude
-    aside = likelihood.model.optics.polarization_deg + _ASIDE_DEG
+    # across the polarisation, the tilt has no slope: begin 20° aside
+    aside = likelihood.model.optics.polarization_deg + 20.0
     box = np.array([reach, reach, 0.0, math.inf, math.inf, math.inf, 1.0])
     found = []
     for azimuth, tilt in _everywhere():
@@ -264,4 +262,5 @@ def _distinct(found: list[ModelFit]) -> list[ModelFit]:
 def _same(one: ModelFit, other: ModelFit) -> bool:
     cosine = min(abs(float(axis_of(one.theta) @ axis_of(other.theta))), 1.0)
     gap = abs(one.log_likelihood - other.log_likelihood)
-    return math.degrees(math.acos(cosine)) < _SAME_DEG and gap < _SAME_VALUE
+    # one maximum, found twice
+    return math.degrees(math.acos(cosine)) < 3.0 and gap < 0.1
