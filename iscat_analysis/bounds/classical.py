@@ -26,8 +26,6 @@ SINGULAR = 1e-9
 It is the squared angle between the derivatives; below it the angle is less than a hundred times the
 3e-7 to which the image's gradient is known, and an inverse would report that error."""
 
-LEAST_INFORMATION_SHARE = 1e-12
-"""Share of the light's information below which a parameter is not seen at all."""
 
 LEAST_COMPONENT = 1e-3
 """Component of an unidentifiable direction below which a parameter is not part of it."""
@@ -114,7 +112,8 @@ def bounds_from_matrices(
     index = [i for i, name in enumerate(names) if name in free]
     seen = np.diag(fisher).copy()
     limit = np.diag(quantum)
-    seen[~(seen > LEAST_INFORMATION_SHARE * limit)] = np.nan
+    # Share of the light's information below which a parameter is not seen at all
+    seen[~(seen > 1e-12 * limit)] = np.nan
     single, joint, qcrb = np.full((3, len(names)), np.nan)
     single[index] = 1 / np.sqrt(seen[index])
     positive = [i for i in index if limit[i] > 0]

@@ -34,9 +34,6 @@ from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-LOST_LIGHT = 1e-3
-"""Excess of the photons on the camera over those collected that betrays coarse sampling."""
-
 
 @dataclass(frozen=True)
 class Experiment:
@@ -282,7 +279,8 @@ def findings_of(experiment: Experiment) -> list[Finding]:
     found, well_depth_e = [], experiment.config.camera.well_depth_e
     if well_depth_e is not None and experiment.peak_e >= well_depth_e:
         found.append(SATURATED_PLAN({"peak_e": experiment.peak_e, "well_depth_e": well_depth_e}))
-    if experiment.on_camera > (1 + LOST_LIGHT) * experiment.collected:
+    # Excess of the photons on the camera over those collected that betrays coarse sampling
+    if experiment.on_camera > (1 + 1e-3) * experiment.collected:
         found.append(COARSE_SAMPLING({"pixel_nm": experiment.grid.pixel_nm}))
     return found
 

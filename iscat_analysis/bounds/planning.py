@@ -451,20 +451,15 @@ def budget(config: Config, parameter: str) -> list[Cost]:
     return lines
 
 
-FINE_PIXELS = 24
-"""Fine pixels per wavelength over NA; finer ones change no bound by 1e-4."""
-
-MOST_PIXELS = 1200
-"""Side of the finest field."""
-
-
 def _refined(config: Config) -> Mapping[str, Mapping[str, Any]]:
     """Divide the same field into pixels so small that they cost nothing."""
     pixel = config.camera.pixel_size_nm
     if pixel is None:
         return {}
-    wanted = math.ceil(pixel * FINE_PIXELS * config.optics.na / config.optics.wavelength_nm)
-    split = max(1, min(wanted, MOST_PIXELS // config.bounds.pixels))
+    # Fine pixels per wavelength over NA; finer ones change no bound by 1e-4
+    wanted = math.ceil(pixel * 24 * config.optics.na / config.optics.wavelength_nm)
+    # Side of the finest field
+    split = max(1, min(wanted, 1200 // config.bounds.pixels))
     return _pixelated(config, pixel / split)
 
 

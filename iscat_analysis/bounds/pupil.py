@@ -52,8 +52,6 @@ KNOBS: Mapping[str, tuple[str, ...]] = {
 }
 """What can be searched, and the keys of ``[optics]`` it stands for."""
 
-SAMPLED = 128
-"""Random pupils for each variable, with and without mask, from which the valleys are chosen."""
 
 BUDGET = 70
 """Evaluations that one descent may take for each of its variables."""
@@ -62,14 +60,6 @@ RADII = (0.3, 2e-3)
 """First and last step of a descent; a unit is a radian, 500 nm of focus, λ/20 rms of a Zernike
 term, a factor e of attenuation, the whole aperture for the mask."""
 
-APART = 0.5
-"""Smallest distance between starts, in these units."""
-
-FULL_WELL = 0.99
-"""Share of the well that the brightest pixel may expect."""
-
-SAME = 1e-4
-"""Relative change of F below which a knob returns to where it was configured: simpler is better."""
 
 NO_BOUND = 50.0
 """ln F of a pupil that does not identify the parameters or saturates the camera."""
@@ -105,7 +95,8 @@ class Search:
 
     def value(self, optics: Optics) -> tuple[float, Optics]:
         """Compute ln F and the optics, dimmed where the well depth requires it."""
-        largest_e = FULL_WELL * (self.config.camera.well_depth_e or math.inf)
+        # Share of the well that the brightest pixel may expect
+        largest_e = 0.99 * (self.config.camera.well_depth_e or math.inf)
         for _ in range(4):
             self.evaluations += 1
             experiment = plan(self.config_of(optics), scale=self.scale)
@@ -132,12 +123,16 @@ class Search:
                 continue
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0, number)))
             low, high = np.array([self.range(key)[0] for key in names]).T
-            points = low + (high - low) * rng.random((SAMPLED * len(names), len(names)))
+            # Random pupils for each variable, with and without mask, from which the valleys are
+            # chosen
+            points = low + (high - low) * rng.random((128 * len(names), len(names)))
             values = [self.value(self.decode(names, point))[0] for point in points]
             distinct: list[FloatArray] = []
             for point in points[np.argsort(values)]:
                 if len(distinct) < starts and all(
-                    np.linalg.norm(point - p) > APART for p in distinct
+                    # Smallest distance between starts, in these units
+                    np.linalg.norm(point - p) > 0.5
+                    for p in distinct
                 ):
                     distinct.append(point)
             chosen += [(names, point) for point in distinct]
@@ -168,7 +163,9 @@ class Search:
                    or best.mask_na}
         )  # fmt: skip
         value, best = self.value(best)
-        worst = value + SAME
+        # Relative change of F below which a knob returns to where it was configured: simpler is
+        # better
+        worst = value + 1e-4
         for key in reversed(self.keys):
             here = setting(self.config.optics, key)
             if setting(best, key) != here:
@@ -241,10 +238,6 @@ def sigmas(experiment: Experiment) -> tuple[FloatArray, FloatArray]:
     free = FREE_PARAMETERS[experiment.config.fit.mode]
     whole = experiment.bounds(PARAMETERS)
     return bounds_from_matrices(whole.fisher, whole.quantum, free).crb_joint, whole.qcrb
-
-
-SEARCHED_NM = 3500.0
-"""Side of the field in which valleys are searched; candidates are compared on the whole field."""
 
 
 @dataclass(frozen=True)
@@ -432,7 +425,9 @@ def _cropped(config: Config) -> Config:
     pixel, at = config.camera.pixel_size_nm, config.bounds
     if pixel is None:
         return config  # `plan` says what is missing
-    needed = math.ceil((SEARCHED_NM + 2 * max(abs(at.x_nm), abs(at.y_nm))) / pixel)
+    # Side of the field in which valleys are searched; candidates are compared on the whole
+    # field
+    needed = math.ceil((3500.0 + 2 * max(abs(at.x_nm), abs(at.y_nm))) / pixel)
     needed += (needed - at.pixels) % 2
     if needed >= at.pixels:
         return config

@@ -45,9 +45,6 @@ NODES = 96
 AZIMUTHS = 16
 """Equally spaced azimuths; |A|² times a squared slope is a trigonometric polynomial of order 8."""
 
-COMMUTES = 1e-9
-"""|Im Q_ij| over √(Q_ii Q_jj) below which a pair counts as commuting: rounding."""
-
 
 def quantum_information(
     model: ForwardModel,
@@ -137,7 +134,8 @@ def incompatible_pairs(information: ComplexArray) -> dict[tuple[str, str], float
         (NAMES[i], NAMES[j]): float(curl[i, j])
         for i in range(4)
         for j in range(i + 1, 4)
-        if curl[i, j] > COMMUTES
+        # |Im Q_ij| over √(Q_ii Q_jj) below which a pair counts as commuting: rounding
+        if curl[i, j] > 1e-9
     }
 
 

@@ -26,8 +26,6 @@ from iscat_analysis.records import BoolArray, FloatArray
 LEAST_EXPLAINED_SHARE = 0.3
 """Share of χ² in excess that a parameter must explain to be named."""
 
-LARGE_EXPLAINED_SHARE = 0.6
-"""Share below which more may be wrong, and a correction of that parameter alone is no advice."""
 
 PIXEL = "camera.pixel_size_nm"
 _PHASE = "reference phase"
@@ -123,7 +121,9 @@ class Cause:
         """One line for the user."""
         elsewhere = "" if self.learned else " with an interferometric movie of the same microscope"
         remedy = f"correct it, or calibrate the optics{elsewhere}"
-        if self.share < LARGE_EXPLAINED_SHARE:
+        # Share below which more may be wrong, and a correction of that parameter alone is no
+        # advice
+        if self.share < 0.6:
             remedy = f"that explains only a part, so calibrate the optics{elsewhere}"
         return (
             f"the model does not describe the brightest particles ({self.events} looked at): what "

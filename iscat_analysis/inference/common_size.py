@@ -68,9 +68,6 @@ _MAXIMA, _HEIGHTS = 4, 3
 UNDETERMINED = 0.5
 """Error of n − n_s, over its size, from which the index is not told."""
 
-APART = 1 / 8
-"""Share of a fringe by which two heights of a frame differ at least."""
-
 
 @dataclass(frozen=True)
 class CommonSize:
@@ -188,7 +185,8 @@ def fit_common_size(
         here = joint.gathered(rows, owners, common)
         if not math.isfinite(here.value):
             return None
-        kept = _still_likely(here, rows, owners, APART * model.fringe_nm)
+        # Share of a fringe by which two heights of a frame differ at least
+        kept = _still_likely(here, rows, owners, (1 / 8) * model.fringe_nm)
         if kept.all() and converged:
             break
         rows, owners = rows[kept], owners[kept]

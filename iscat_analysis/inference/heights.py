@@ -31,9 +31,6 @@ from iscat_analysis.config import Config
 from iscat_analysis.medians import SIGMA_PER_MAD
 from iscat_analysis.records import FloatArray
 
-REACH = 5.0
-"""Standard deviations of the prior within which the height is searched."""
-
 
 @dataclass(frozen=True)
 class HeightPrior:
@@ -50,7 +47,8 @@ class HeightPrior:
     @property
     def range_nm(self) -> tuple[float, float]:
         """Heights that are searched [nm]."""
-        away = REACH * self.sd_nm
+        # Standard deviations of the prior within which the height is searched
+        away = 5.0 * self.sd_nm
         return self.mean_nm - away, self.mean_nm + away
 
     def log_density(self, heights_nm: FloatArray) -> FloatArray:
@@ -75,8 +73,6 @@ def has_prior(config: Config) -> bool:
 FEWEST = 6
 """Events without which nothing is said of the spread of heights."""
 
-SIGNIFICANT = 20.0
-"""Twice the gain in log-likelihood by which a spread is told from none; by chance in 1e-5."""
 
 _FINEST_NM, _WIDEST_NM, _WIDTHS = 0.05, 300.0, 240  # spreads that are tried
 _IN_95 = 3.84  # twice the fall of the log-likelihood at the ends of a 95 % interval
@@ -109,7 +105,9 @@ class HeightSpread:
     @property
     def is_spread(self) -> bool:
         """Whether heights differ by more than their errors."""
-        return self.excess > SIGNIFICANT
+        # Twice the gain in log-likelihood by which a spread is told from none; by chance in
+        # 1e-5
+        return self.excess > 20.0
 
     def __str__(self) -> str:
         """Say it as a result."""

@@ -40,12 +40,6 @@ from iscat_analysis.records import (
 )
 from iscat_analysis.units import sphere_diameter_nm
 
-MISSED_SHARE = 0.05
-"""Share of the light of a sphere of 30 nm and more that a dipole does not describe."""
-
-LEFT_SHARE = 0.1
-"""Share of the dipole's excess of χ² that a sphere may have if it does not describe all."""
-
 _STRENGTHS = np.geomspace(0.007, 0.25, 10)  # light per volume of a sphere whose index is fitted
 _REACHES_NM = (900.0, 700.0, 600.0, 500.0)  # around an image's centre, which each improves
 
@@ -79,7 +73,8 @@ class _Sphere(NamedTuple):
 def may_be_large(likelihood: Likelihood, fit: FitResult) -> bool:
     """Tell whether a dipole misses as much as of a sphere, or is too heavy to be a dipole."""
     missed = (fit.chi2_reduced - 1) * likelihood.n_pixels
-    if Status.POOR_FIT in fit.flags and missed > MISSED_SHARE * fit.snr**2:
+    # Share of the light of a sphere of 30 nm and more that a dipole does not describe
+    if Status.POOR_FIT in fit.flags and missed > 0.05 * fit.snr**2:
         return True
     model = likelihood.model
     diameter = sphere_diameter_nm(abs(fit.mass_kda), model.material.density_kg_m3)
@@ -111,7 +106,8 @@ def recognised(
     best = found[0]
     sphere = fit_seated(best.likelihood, best.optimum.theta, level=level)
     excess, left = (max(one[1].chi2_reduced - 1, 0.0) for one in ((likelihood, fit), sphere))
-    if sphere[1].p_value < POOR_FIT_P and left > LEFT_SHARE * excess:
+    # Share of the dipole's excess of χ² that a sphere may have if it does not describe all
+    if sphere[1].p_value < POOR_FIT_P and left > 0.1 * excess:
         return None
     start = Candidate(*_place(likelihood, begin), float(begin[2]), fit.mass_kda, fit.snr)
     lifted = fit_particle(replace(likelihood, prior=None), start, "joint", z_range_nm, level=level)

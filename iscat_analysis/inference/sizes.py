@@ -24,15 +24,6 @@ from iscat_analysis.records import Alternative, Box
 
 FloatArray = NDArray[np.float64]
 
-LIGHT_RATIO = 1.5
-"""Ratio of the scattered amplitudes of neighbouring diameters of the scan, of small spheres."""
-
-FRINGE_SHARE = 1 / 16
-"""Largest step of the diameter in the scan over the fringe λ/(2 n_s): an eighth of a turn of the
-phase of the light scattered backwards."""
-
-HEIGHTS_PER_FRINGE = 8
-"""Heights scanned per interference fringe."""
 
 AMBIGUITY_ODDS = 1000.0
 """Another height or diameter whose odds against the best are shorter than this is reported as
@@ -95,14 +86,18 @@ def scan_sizes(
 
 def scanned_heights(model: ForwardModel, low_nm: float, high_nm: float) -> FloatArray:
     """Heights of a scan from one end of a range to the other [nm], shape (n,)."""
-    count = math.ceil((high_nm - low_nm) / model.fringe_nm * HEIGHTS_PER_FRINGE) + 1
+    # Heights scanned per interference fringe
+    count = math.ceil((high_nm - low_nm) / model.fringe_nm * 8) + 1
     return np.linspace(low_nm, high_nm, max(count, 3))
 
 
 def scanned_masses(model: SizedModel, low_kda: float, high_kda: float) -> FloatArray:
     """Masses of a scan from one end of a range to the other [kDa], shape (n,)."""
     low, high = (model.sphere.of_mass(mass).diameter_nm for mass in (low_kda, high_kda))
-    ratio, step = LIGHT_RATIO ** (1 / 3), FRINGE_SHARE * model.fringe_nm
+    # Ratio of the scattered amplitudes of neighbouring diameters of the scan, of small spheres
+    # Largest step of the diameter in the scan over the fringe λ/(2 n_s): an eighth of a turn of
+    # the phase of the light scattered backwards
+    ratio, step = 1.5 ** (1 / 3), (1 / 16) * model.fringe_nm
     diameters = [low]
     while diameters[-1] < high:
         diameters.append(min(diameters[-1] * ratio, diameters[-1] + step))

@@ -57,9 +57,6 @@ PEAK_SEARCH_RADIUS = 4.0
 """Largest distance, over λ/NA, at which the peak contrast of a calibration is searched: out of
 focus the peak lies on a ring, and the mass scale must not depend on the size of a model."""
 
-DONG2021_FIELD_NODES = 110
-"""Nodes of the rectangle rule in D21's program for fields."""
-
 
 def forward_model(
     config: Config, reach_nm: float, *, z_max_nm: float | None = None, nodes: int | None = None
@@ -176,7 +173,8 @@ def _pupil(
     intervals = math.ceil(reach_nm * k * optics.na / STEP) + 2
     check_table("the radial table", 6 * (30 + 0.45 * k * path) * intervals)
     if optics.convention == "dong2021":
-        return aperture_on(optics, *rectangle(alpha, nodes or DONG2021_FIELD_NODES), scatterer)
+        # Nodes of the rectangle rule in D21's program for fields
+        return aperture_on(optics, *rectangle(alpha, nodes or 110), scatterer)
     beyond = max(0.0, (alpha - critical) / alpha) if critical else 0.0
     return aperture(
         optics,

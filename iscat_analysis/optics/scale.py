@@ -25,9 +25,6 @@ LARGEST_SCALE_CHANGE = 1 / 3
 """Largest change of the contrast per kDa, from the optics of the standards to others, for which the
 model converts the scale: beyond it, small errors of the optics are large errors of the mass."""
 
-SAME_WAVELENGTH_NM = 1.0
-"""Two wavelengths that differ by less are of the same laser line."""
-
 
 def carry_refusal(here: Optics, there: Optics, ratio: float) -> str:
     """Say why the model does not convert the scale of standards to other optics; else nothing."""
@@ -35,7 +32,8 @@ def carry_refusal(here: Optics, there: Optics, ratio: float) -> str:
         mine, theirs = getattr(here, key), getattr(there, key)
         if mine != theirs:
             return f"they were measured with optics.{key} = {theirs}, and this is {mine}"
-    if abs(here.wavelength_nm - there.wavelength_nm) > SAME_WAVELENGTH_NM:
+    # Two wavelengths that differ by less are of the same laser line
+    if abs(here.wavelength_nm - there.wavelength_nm) > 1.0:
         return (
             f"they were measured at {there.wavelength_nm:g} nm, and this is at "
             f"{here.wavelength_nm:g} nm"

@@ -190,10 +190,6 @@ def parts_of(model: ForwardModel) -> dict[str, Any]:
     return {each.name: getattr(model, each.name) for each in fields(ForwardModel)}
 
 
-LARGEST_DIPOLE = 1 / 16
-"""Diameter of a compact particle over the wavelength in the sample beyond which it is no dipole:
-light from its far side is an eighth of a period late."""
-
 VESICLE, SPHERE = "vesicle", "sphere"
 LEAST_CONTRAST, MIDDLE_CONTRAST, LARGEST_INDEX = 0.005, 0.07, 1.8
 """Of the index of a sphere that is fitted: its least and a middling difference from the sample's,
@@ -207,7 +203,9 @@ _MOST_STRENGTH = 0.9  # an index of five times the sample's
 
 def largest_dipole_nm(optics: Optics) -> float:
     """Give the diameter of a compact particle beyond which it is no dipole."""
-    return LARGEST_DIPOLE * optics.wavelength_nm / optics.n_sample
+    # Diameter of a compact particle over the wavelength in the sample beyond which it is no
+    # dipole: light from its far side is an eighth of a period late
+    return (1 / 16) * optics.wavelength_nm / optics.n_sample
 
 
 @dataclass(frozen=True)

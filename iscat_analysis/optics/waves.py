@@ -428,13 +428,6 @@ def _in_fours(values: Any, mode: Literal["constant", "edge"] = "constant") -> An
     return np.pad(values, padding, mode=mode)
 
 
-NEGLIGIBLE_CHANGE = 1e-6
-"""Share of the change of light below which its azimuthal harmonics are left out."""
-
-STEP_RATIO = 2
-"""Radial step of these tables over that of the field: their error is one part in 10⁶."""
-
-
 def check_names(opening: Aperture, names: Sequence[str]) -> None:
     """Refuse parameters that have no derivative."""
     optics, known = opening.optics, MEASURABLE
@@ -475,12 +468,14 @@ def sensitivity_lattices(
         ]
     )
     waves = light.waves.reshape(-1, *light.waves.shape[2:])
-    series = harmonics(waves, np.abs(light.weight), NEGLIGIBLE_CHANGE) * light.weight
+    # Share of the change of light below which its azimuthal harmonics are left out
+    series = harmonics(waves, np.abs(light.weight), 1e-6) * light.weight
     count = light.waves.shape[1]
     lattice = LatticeField(
         series[:count], light.axial, light.transverse, band_of(optics), reach_nm, cone_of(optics)
     )
-    stack = lattice.lattices(series, light.transverse, STEP_RATIO)
+    # Radial step of these tables over that of the field: their error is one part in 10⁶
+    stack = lattice.lattices(series, light.transverse, 2)
     whole = stack.reshape(2 + len(names), lattice.count, *stack.shape[1:])
     return lattice.lens(rho), whole
 

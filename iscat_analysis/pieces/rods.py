@@ -30,9 +30,6 @@ from iscat_analysis.pieces.counts import config_of, gather
 from iscat_analysis.pieces.regions import EDGE_SHARE
 from iscat_analysis.records import Box, FloatArray, Status, verdict
 
-WIDE_DEG = 5.0
-"""Error of the direction above which it is flagged as well: it is no longer normal."""
-
 AMPLITUDE, AZIMUTH, TILT = 3, 4, 5
 _NAMES = {"x_nm": 0, "y_nm": 1, "mass_kda": AMPLITUDE, "azimuth_deg": AZIMUTH, "tilt_deg": TILT}
 
@@ -145,7 +142,8 @@ def _row(likelihood: Likelihood, found: list[ModelFit], rod: Rod) -> dict[str, A
     if p_value < POOR_FIT_P:
         flags.append(Status.POOR_FIT)
     wide = max(best.sigma[TILT], best.sigma[AZIMUTH] * math.sin(math.radians(best.theta[TILT])))
-    if odds > 1 / AMBIGUITY_ODDS or not wide < WIDE_DEG:
+    # Error of the direction above which it is flagged as well: it is no longer normal
+    if odds > 1 / AMBIGUITY_ODDS or not wide < 5.0:
         flags.append(Status.AMBIGUOUS_DIRECTION)
     values = {name: float(best.theta[k]) for name, k in _NAMES.items()}
     sigmas = {f"sigma_{name}": float(best.sigma[k]) for name, k in _NAMES.items()}
