@@ -39,7 +39,7 @@ HIGHER = ("z22",)
 
 
 @dataclass(frozen=True)
-class Parameter:
+class OpticsParameter:
     """A continuous parameter of the optics that pictures may tell."""
 
     group: str
@@ -59,24 +59,24 @@ class Parameter:
     """The change that makes no difference."""
 
 
-_EVEN, _ODD = (Parameter("zernike", 25.0, 10.0, mirrored=sign) for sign in (-1, 1))
+_EVEN, _ODD = (OpticsParameter("zernike", 25.0, 10.0, mirrored=sign) for sign in (-1, 1))
 
 PARAMETERS = {
-    "focus_nm": Parameter("focus", 120.0, 150.0),
-    FOCUS_STEP: Parameter("focus", 2.0, 5.0, -1),
-    DRIFT: Parameter("focus", 100.0, 150.0, -1),
-    BEND: Parameter("focus", 500.0, 500.0, -1),
-    **dict.fromkeys(JUMPS, Parameter("focus", 100.0, 150.0, -1)),
-    "na": Parameter("na", 0.02, 0.01),
-    "reference_phase_deg": Parameter("phase", 40.0, 20.0, -1, period=360.0),
-    "mask_na": Parameter("mask", 0.1, 0.02),
-    "attenuation": Parameter("mask", 0.1, 0.05),
+    "focus_nm": OpticsParameter("focus", 120.0, 150.0),
+    FOCUS_STEP: OpticsParameter("focus", 2.0, 5.0, -1),
+    DRIFT: OpticsParameter("focus", 100.0, 150.0, -1),
+    BEND: OpticsParameter("focus", 500.0, 500.0, -1),
+    **dict.fromkeys(JUMPS, OpticsParameter("focus", 100.0, 150.0, -1)),
+    "na": OpticsParameter("na", 0.02, 0.01),
+    "reference_phase_deg": OpticsParameter("phase", 40.0, 20.0, -1, period=360.0),
+    "mask_na": OpticsParameter("mask", 0.1, 0.02),
+    "attenuation": OpticsParameter("mask", 0.1, 0.05),
     **{
         name: _ODD if name in ("z7", "z8", "z9", "z10") else _EVEN
         for name in PRIMARY + SECONDARY + HIGHER
     },
     "z11": replace(_EVEN, usual_error=20.0),
-    "polarization_deg": Parameter("polarization", 30.0, 45.0, period=180.0),
+    "polarization_deg": OpticsParameter("polarization", 30.0, 45.0, period=180.0),
 }
 """Every continuous parameter, in the order of results.  A new one is a row here, a value in
 `settings_of`, and a derivative of the forward model."""
