@@ -167,12 +167,13 @@ def bounds(
 def _scan(messages: Messages, config: Config, text: str, report: dict[str, Any]) -> dict[str, Any]:
     """Run a scan, add it to the report, and return what the figure needs."""
     from iscat_analysis.bounds import parse_scan, scan
+    from iscat_analysis.findings.setup import LIGHT_HELD
 
     axis, values = parse_scan(text)
     with messages.progress() as progress:
         found = scan(config, axis, values, progress=progress)
     if axis.name in ("attenuation", "pixel"):
-        messages.note("the light on the particle is held: photons_per_pixel follows")
+        messages.report(LIGHT_HELD({"axis": axis.name}))
     along = {"label": found.label, "here": found.here}
     report["scan"] = {"name": found.name, **along, "columns": found.table.to_dict("list")}
     return {"table": found.table, **along}
@@ -210,6 +211,7 @@ def _search_pupil(
 ) -> dict[str, Any]:
     """Search, add the optimum to the report, and return what the folder needs."""
     from iscat_analysis.bounds import optimize_pupil, parse_names
+    from iscat_analysis.findings.setup import OFFSET_LEFT_OUT
 
     names = None if free is None else [name.strip() for name in free.split(",")]
     with messages.progress() as progress:
@@ -218,10 +220,7 @@ def _search_pupil(
         )
     report["pupil"] = best.to_dict()
     if config.calibration is not None and config.calibration.offset:
-        messages.note(
-            "warning: calibration.offset is left out, because it belongs to the configured optics: "
-            "σ of the mass is that of a mass proportional to the field"
-        )
+        messages.report(OFFSET_LEFT_OUT())
     return {"design": best}
 
 

@@ -132,13 +132,14 @@ class MovieSetup(Setup):
         """Read the configuration of a movie: those given, else ``iscat.toml`` beside it."""
         from iscat_analysis.calibration.line import with_line
         from iscat_analysis.config import load_config
+        from iscat_analysis.findings.setup import CONFIGURATION_BESIDE
         from iscat_analysis.movie import setup_beside
         from iscat_analysis.reading import is_file
 
         source: Path | list[Path] | None = self.config
         beside = setup_beside(movie)
         if not source and is_file(beside):
-            messages.note(f"the configuration is {beside}, which lies beside the movie")
+            messages.report(CONFIGURATION_BESIDE({"path": str(beside)}))
             source = beside
         return load_config(with_line(source, self.calibration), self.changes)
 
@@ -243,7 +244,9 @@ def command(work: Callable[..., None]) -> Command:
         )
         if len(configs := given.get("config") or ()) > 1:
             first, *later = map(str, configs)
-            told.note(f"the configuration is {first}, with the keys of {', then '.join(later)}")
+            from iscat_analysis.findings.setup import CONFIGURATION_MERGED
+
+            told.report(CONFIGURATION_MERGED({"first": first, "others": ", then ".join(later)}))
         for name, group in groups.items():
             given[name] = group(**{field.name: given.pop(field.name) for field in fields(group)})
         with failures(told):

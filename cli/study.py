@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.table import Table
 
+    from iscat_analysis.findings import Finding
     from iscat_contest.estimators import Estimator
 
 SUMMARY = "Make movies of withheld truth; score any program on them."
@@ -189,7 +190,7 @@ def benchmark(
         write_archive(output.out, estimators.archive, title="Benchmark", overwrite=output.overwrite)
     lines = [benchmark_table(study), *([_ranking(study)] if others else [])]
     messages.show("benchmark", study, [*lines, f"report: {output.out / 'benchmark.html'}"])
-    messages.note(*_left_out(study))
+    messages.report(*_left_out(study))
 
 
 def _known_estimators() -> Table:
@@ -199,8 +200,9 @@ def _known_estimators() -> Table:
     return table("estimator", "what it is", "", rows=rows, left=(0, 1, 2))
 
 
-def _left_out(study: Mapping[str, Any]) -> Iterator[str]:
+def _left_out(study: Mapping[str, Any]) -> Iterator[Finding]:
     """Say where fits are part of no bias and no spread though they did not fail."""
+    from iscat_analysis.findings.setup import AMBIGUOUS_FITS
     from iscat_analysis.report.benchmark import MODES
 
     alike = (
@@ -209,13 +211,8 @@ def _left_out(study: Mapping[str, Any]) -> Iterator[str]:
     )
     for mode, (status, several, key) in product(MODES, alike):
         if mode in study and (ambiguous := study[mode]["flagged"][status]):
-            verb = "is" if ambiguous == 1 else "are"
-            yield (
-                f"mode {mode}: of {study[mode]['trials']} fits {ambiguous} {verb} {status} and "
-                f"left out of bias and spread: several {several} describe the pixels about as "
-                "well; more photons or frames (bounds.photons_per_pixel, bounds.n_after) or a "
-                f"narrower {key} tell which"
-            )
+            values = {"mode": mode, "ambiguous": ambiguous, "trials": study[mode]["trials"]}
+            yield AMBIGUOUS_FITS(values | {"status": status, "several": several, "key": key})
 
 
 def benchmark_table(study: Mapping[str, Any]) -> Table:

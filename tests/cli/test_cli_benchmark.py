@@ -84,7 +84,7 @@ def test_fits_of_ambiguous_height_that_are_left_out_are_told(
     arguments = ["--config", str(sample_configs["mass"]), "--out", str(tmp_path / "out"), *dim]
     assert main(["benchmark", *arguments, "--trials", "20"]) == 0
     said = capsys.readouterr().err
-    assert "mode joint: of 20 fits 20 are ambiguous_z and left out" in said
+    assert "mode joint: 20 of 20 fits have the status ambiguous_z and are left out" in said
     assert "mode mass" not in said
 
 
