@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import platform
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -98,59 +99,31 @@ def run_benchmark(
     tally = _Tally(
         progress, len(modes) * (trials + fewer * (len(PHOTONS) + HEIGHTS) + posteriors * 4)
     )
+    run = partial(run_trials, seed=seed, workers=threads, advance=tally)
+    sample = partial(
+        calibrate_posterior, seed=seed, workers=threads, advance=lambda n: tally(4 * n)
+    )
     study: dict[str, Any] = {}
     curves: dict[str, dict[str, Any]] = {"photons": {}, "z": {}}
     histograms: dict[str, dict[str, Any]] = {"pulls": {}, "ranks": {}}
     for number, (mode, setting) in enumerate(settings.items()):
         stream = 100 * number
-        found = run_trials(
-            setting, trials, seed=seed, stream=stream, workers=threads,
-            keep_counts=mode != "size", advance=tally,
-        )  # fmt: skip
+        found = run(setting, trials, stream=stream, keep_counts=mode in OF_DIPOLES)
         lower, upper = _prior(setting)
-        ranked = calibrate_posterior(
-            setting, posteriors, lower=lower, upper=upper, seed=seed, stream=stream + 1,
-            workers=threads, advance=lambda n: tally(4 * n),
-        )  # fmt: skip
-        study[mode] = {
-            **_parameters(setting, found, ranked),
-            "trials": trials,
-            "failed": int(found.failed.sum()),
-            "flagged": {str(s): int(found.flagged(s).sum()) for s in Status if s != Status.OK},
-            "fits_per_second": trials / found.seconds if found.seconds else math.nan,
-            "posteriors": posteriors,
-            "posteriors_refused": ranked.refused,
-            "seed": seed,
-            "at": setting.described(),
-        }
+        ranked = sample(setting, posteriors, lower=lower, upper=upper, stream=stream + 1)
+        study[mode] = _scores(setting, found, ranked) | {"posteriors": posteriors, "seed": seed}
         histograms["pulls"][mode] = {
             name: pull_histogram(_pull(found, k)) for name, k in setting.scored.items()
         }
         histograms["ranks"][mode] = _rank_histograms(ranked)
-        faintest = make_setting(config, mode, collected=PHOTONS[0], context=setting.context)
-        clear = float(faintest.truth[2])  # far enough from the ends of the range for all photons
-        curves["photons"][mode] = _curve(
-            list(PHOTONS),
-            [make_setting(config, mode, collected=n, z_nm=clear, context=setting.context)
-             for n in PHOTONS],
-            fewer, seed, stream + 10, threads, tally,
-        )  # fmt: skip
-        heights = _heights(config)
-        curves["z"][mode] = _curve(
-            heights,
-            [make_setting(config, mode, z_nm=z, context=setting.context) for z in heights],
-            fewer, seed, stream + 40, threads, tally,
-        )  # fmt: skip
-        curves["z"][mode]["bounds"] = _bounds_along(config, setting)
+        shorter = partial(run, count=fewer)
+        curves["photons"][mode] = _along_photons(config, setting, stream + 10, shorter)
+        curves["z"][mode] = _along_heights(config, setting, stream + 40, shorter)
     if estimators:
         others = compare_estimators(
-            config,
-            estimators,
-            trials=trials,
-            seed=seed,
-            time_limit_s=time_limit_s,
+            config, estimators, trials=trials, seed=seed, time_limit_s=time_limit_s,
             progress=progress,
-        )
+        )  # fmt: skip
         parts = {
             mode: {
                 "bounds": dict.fromkeys(setting.free),
@@ -211,8 +184,8 @@ def laboratory_estimates(setting: Setting, trials: Trials) -> dict[str, dict[str
     return {"gaussian": answer(gauss_ls, job).columns, "peak": answer(peak, job).columns}
 
 
-def _parameters(setting: Setting, found: Trials, ranked: PosteriorRanks) -> dict[str, Any]:
-    """Score every free parameter."""
+def _scores(setting: Setting, found: Trials, ranked: PosteriorRanks) -> dict[str, Any]:
+    """Score every free parameter, and count what failed."""
     (crbs, qcrbs), kept = (setting.crb, setting.qcrb), found.usable
     error = found.estimate - found.truth
     labs = laboratory_estimates(setting, found)
@@ -247,7 +220,14 @@ def _parameters(setting: Setting, found: Trials, ranked: PosteriorRanks) -> dict
             "posterior_width_over_crb": _mean(ranked.width_over_crb[ranked.kept, i]),
             "baselines": baselines,
         }
-    return out
+    return out | {
+        "trials": len(found),
+        "failed": int(found.failed.sum()),
+        "flagged": {str(s): int(found.flagged(s).sum()) for s in Status if s != Status.OK},
+        "fits_per_second": len(found) / found.seconds if found.seconds else math.nan,
+        "posteriors_refused": ranked.refused,
+        "at": setting.described(),
+    }
 
 
 def _rank_histograms(ranked: PosteriorRanks) -> dict[str, Any]:
@@ -262,24 +242,35 @@ def _rank_histograms(ranked: PosteriorRanks) -> dict[str, Any]:
     return out
 
 
-def _curve(
-    values: list[float],
-    settings: list[Setting],
-    trials: int,
-    seed: int,
-    stream: int,
-    workers: int,
-    tally: _Tally,
-) -> dict[str, Any]:
+Run = Callable[..., Trials]
+"""`run_trials` for a setting and a stream, with the rest of a benchmark's choices."""
+
+
+def _along_photons(config: Config, setting: Setting, stream: int, run: Run) -> dict[str, Any]:
+    """Tabulate spread and bounds against the light, at a height far from the range's ends."""
+    make = partial(make_setting, config, setting.mode, context=setting.context)
+    clear = float(make(collected=PHOTONS[0]).truth[2])
+    settings = [make(collected=photons, z_nm=clear) for photons in PHOTONS]
+    return _curve(list(PHOTONS), settings, stream, run)
+
+
+def _along_heights(config: Config, setting: Setting, stream: int, run: Run) -> dict[str, Any]:
+    """Tabulate spread and bounds against the height; the bounds between its points as well."""
+    heights = _heights(config)
+    make = partial(make_setting, config, setting.mode, context=setting.context)
+    curve = _curve(heights, [make(z_nm=z) for z in heights], stream, run)
+    return curve | {"bounds": _bounds_along(config, setting)}
+
+
+def _curve(values: list[float], settings: list[Setting], stream: int, run: Run) -> dict[str, Any]:
     """Tabulate spread and bounds along an axis, for every free parameter."""
     scored = settings[0].scored
-    out: dict[str, Any] = {"at": values, "trials": trials, "failed": [], "ambiguous": []}
+    out: dict[str, Any] = {"at": values, "trials": 0, "failed": [], "ambiguous": []}
     kinds = ("spread", "spread_ci95", "bias", "crb", "qcrb")
     lines: dict[str, dict[str, list[Any]]] = {n: {kind: [] for kind in kinds} for n in scored}
     for number, setting in enumerate(settings):
-        found = run_trials(
-            setting, trials, seed=seed, stream=stream + number, workers=workers, advance=tally
-        )
+        found = run(setting, stream=stream + number)
+        out["trials"] = len(found)
         out["failed"].append(int(found.failed.sum()))
         out["ambiguous"].append(int(found.ambiguous.sum()))
         (crb, qcrb), kept = (setting.crb, setting.qcrb), found.usable
