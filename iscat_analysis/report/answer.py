@@ -81,6 +81,8 @@ class RowKind:
         Verdicts on them.
     begins, heading : str
         Column of the first frame, and its heading.
+    fits, unit : str
+        What the rows of ``fits.csv`` are, at the beginning of a sentence and in a heading.
     short : str
         Verdict on rows that are too short to be judged; empty if there is none.
     """
@@ -90,14 +92,22 @@ class RowKind:
     status: type[Status] | type[TrackStatus]
     begins: str
     heading: str
+    fits: str
+    unit: str
     short: str = ""
 
 
-EVENTS_KIND = RowKind("event", "events", Status, "frame", "frame")
+EVENTS_KIND = RowKind("event", "events", Status, "frame", "frame", "Events", "events")
 TRACKS_KIND = RowKind(
-    "track", "that are long enough", TrackStatus, "first_frame", "from frame",
+    "track",
+    "that are long enough",
+    TrackStatus,
+    "first_frame",
+    "from frame",
+    "Single frames",
+    "frames",
     TrackStatus.FEW_FRAMES.value,
-)  # fmt: skip
+)
 
 
 def row_kind(analysis: Analysis) -> RowKind:

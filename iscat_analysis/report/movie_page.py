@@ -182,15 +182,14 @@ def page_context(
 ) -> dict[str, Any]:
     """Collect everything that ``report.html`` shows except figures."""
     kind, source = row_kind(analysis), analysis.provenance.input_path
-    tracked = kind is TRACKS_KIND
-    rows = tracks_of(analysis).rename(columns={"track": "event"}) if tracked else table
+    rows, facts, cells = _SHOWN[kind](analysis, table)
     images = event_details(analysis, rows)
     sampled = [view for view in analysis.views if view.posterior is not None]
     started = _when(analysis.provenance.started)
     cautions, lines = not_a_mass(analysis), headline(analysis, table)
     free = free_parameters(analysis.mode, table)
     precision = [precision_of(analysis, table, name) for name in free]
-    left_out = 0 < len(images) < len(rows) and not tracked
+    left_out = 0 < len(images) < len(rows)
     findings = sorted(analysis.findings, key=_rank)
     species = _species(analysis, table)
     context: dict[str, Any] = {
@@ -199,12 +198,12 @@ def page_context(
         f"{started}".rstrip(),
         "footer": "iscat-analysis "
         f"{analysis.provenance.versions.get('iscat-analysis', '')}, {started}".rstrip(", "),
-        "tracked": tracked,
+        "tracked": kind is TRACKS_KIND,
         "n_events": len(rows),
         "cautions": [line for line in lines if line in cautions],
         "headline": [line for line in lines if line not in cautions],
         "flagged": bool(len(rows)) and caution(rows, kind) is not None,
-        "tiles": _track_facts(analysis, table) if tracked else _facts(analysis, table),
+        "tiles": facts,
         "totals": f"{tally(rows).text(kind.noun)}.",
         "precision": _precision_table(analysis, precision),
         "has_measured": any(p.is_measured for p in precision),
@@ -215,7 +214,7 @@ def page_context(
         "notes": [f.text for f in findings if f.severity is Severity.NOTE],
         "main_label": main_quantity(analysis).label.capitalize(),
         "signs": _SIGNS.get(main_quantity(analysis).column),
-        "events": track_rows(analysis) if tracked else event_rows(analysis, table),
+        "events": _openable(kind, rows, cells),
         "has_traces": any(detail.trace for detail in images.values()),
         "images": {str(row): list(packed) for row, packed in images.items()},
         "embedding_note": f"To keep this page small it holds the images of the first {len(images)} "
@@ -223,7 +222,7 @@ def page_context(
         if left_out
         else None,
         "films": list(films_shown(analysis, folder)),
-        "track_lines": list(track_lines(analysis.summary)) if tracked else [],
+        "track_lines": list(track_lines(analysis.summary)),
         "posterior": _posterior_table(sampled, table),
         "refused": _refused_table(sampled),
         "verdicts": _verdicts(analysis, table),
@@ -325,7 +324,7 @@ def _track_facts(analysis: Analysis, fits: pd.DataFrame) -> list[Fact]:
 
 
 def _precision_table(analysis: Analysis, precision: Sequence[Precision]) -> Table:
-    tracked = analysis.tracks is not None
+    kind = row_kind(analysis)
     where = (
         "of single frames where there is no particle"
         if analysis.mode_kind.follows_tracks
@@ -377,7 +376,7 @@ def _precision_table(analysis: Analysis, precision: Sequence[Precision]) -> Tabl
             f"({'Holevo' if has_holevo else 'QCRB'} / CRB) squared: the share that the images "
             "carry of what can be had of the light's information",
         ),
-        numeric("frames" if tracked else "events", lambda p: str(p.events)),
+        numeric(kind.unit, lambda p: str(p.events)),
     ]
     known = {
         "common": any(math.isfinite(p.systematic) for p in precision),
@@ -385,8 +384,7 @@ def _precision_table(analysis: Analysis, precision: Sequence[Precision]) -> Tabl
         "measured / CRB": any(p.is_measured for p in precision),
     }
     columns = [column for column in columns if known.get(column.label, True)]
-    rows = "Single frames" if tracked else "Events"
-    caption = f"{rows} whose status is ok; units in the first column"
+    caption = f"{kind.fits} whose status is ok; units in the first column"
     return replace(tabulate(precision, columns, caption), sortable=False)
 
 
@@ -489,15 +487,15 @@ def _verdict_table(kind: RowKind, rows: pd.DataFrame, counted: str, caption: str
 # ---- The table whose rows open -------------------------------------------------------------------
 
 
-def event_rows(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any]:
-    """Write the table of events, one column of one kind with the same decimals throughout."""
+def _events_shown(analysis: Analysis, table: pd.DataFrame) -> Shown:
+    """Give the events, their facts and the columns of their table."""
     shown = []
     for name, heading in _headings(analysis):
         if name in table:
             scale = 1e3 if name == "contrast" else 1.0
             values = scale * table[name].to_numpy(float)
             shown.append((heading, _cells(name, values, values, 3)))
-    return _openable(EVENTS_KIND, table, shown)
+    return table, _facts(analysis, table), shown
 
 
 def _headings(analysis: Analysis) -> Iterator[tuple[str, str]]:
@@ -516,8 +514,8 @@ def _headings(analysis: Analysis) -> Iterator[tuple[str, str]]:
     yield from ((column.name, column.heading) for column in rest[last:])
 
 
-def track_rows(analysis: Analysis) -> dict[str, Any]:
-    """Write the table of tracks."""
+def _tracks_shown(analysis: Analysis, table: pd.DataFrame) -> Shown:
+    """Give the tracks, their facts and the columns of their table."""
     tracks = tracks_of(analysis)
     headings = {column.name: column.heading for column in TRACKS}
     names, scale = {name: headings[name] for name in _TRACK_COLUMNS}, 1.0
@@ -536,7 +534,15 @@ def track_rows(analysis: Analysis) -> dict[str, Any]:
             columns = (tracks[name], tracks[name] if error is None else error)
             values, spread = (factor * column.to_numpy(float) for column in columns)
             shown.append((heading, _cells(name, values, spread, digits)))
-    return _openable(TRACKS_KIND, tracks.rename(columns={"track": "event"}), shown)
+    numbered = tracks_of(analysis).rename(columns={"track": "event"})
+    return numbered, _track_facts(analysis, table), shown
+
+
+Shown = tuple[pd.DataFrame, list[Fact], list[tuple[str, list[str]]]]
+_SHOWN: Mapping[RowKind, Callable[[Analysis, pd.DataFrame], Shown]] = {
+    EVENTS_KIND: _events_shown,
+    TRACKS_KIND: _tracks_shown,
+}
 
 
 def _cells(name: str, values: FloatArray, spread: FloatArray, digits: int) -> list[str]:

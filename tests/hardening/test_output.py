@@ -594,22 +594,3 @@ def test_tables_read_back_by_their_own_libraries(tmp_path: Path, mode: str) -> N
         np.testing.assert_allclose(text[name], frame[name], rtol=1e-8, atol=0)
     assert text["status"].tolist() == frame["status"].tolist()
     assert text["flags"].fillna("").tolist() == frame["flags"].tolist()
-
-
-@pytest.mark.usefixtures("sketched")
-def test_posteriors_read_back_by_arviz(tmp_path: Path) -> None:
-    import warnings
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # of arviz, on import, once a day
-        import arviz
-
-    out = write_report(make_analysis(4, "joint", posteriors=3), tmp_path / "out")
-    data = arviz.from_netcdf(out / "posterior.nc")
-    try:
-        summary = arviz.summary(data.posterior.sel(event=data.posterior["event"].values[0]))
-        assert {"x_nm", "y_nm", "z_nm", "mass_kda"} <= set(summary.index)
-        assert np.isfinite(summary["mean"]).all()
-        assert data.posterior["z_nm"].attrs["units"] == "nm"
-    finally:
-        data.close()

@@ -227,7 +227,7 @@ def test_species_are_the_same_after_a_round_trip(landings: Path, layout: Any) ->
     assert back.efficiency is not None
     assert own.efficiency is not None
     assert back.efficiency.sigma_kda == pytest.approx(own.efficiency.sigma_kda, rel=1e-5)
-    assert back.notes == own.notes == ()
+    assert back.findings == own.findings == ()
 
 
 def test_tables_without_masses_say_so(landings: Path, tmp_path: Path) -> None:
