@@ -242,10 +242,10 @@ def learn(name: str, changes: Mapping[str, Any], seed: int) -> dict[str, Any]:
     landings = draw_landings(AUTO_SHAPE, AUTO_COUNT, seed=seed)
     movie = InstrumentMovie(truth, AUTO_SHAPE, landings, seed=seed + 1)
     config = nominal(learning=True)
-    said: list[str] = []
     camera = camera_from_config(config.camera, movie.shape[1:], movie.dtype)
     start = time.perf_counter()
-    config, found = learn_optics(movie, config, camera, warn=said.append)
+    config, found, findings = learn_optics(movie, config, camera)
+    said = [finding.text for finding in findings]
     learning = time.perf_counter() - start
     result = analyse(movie, config, said)
     table = counted(result)

@@ -11,8 +11,7 @@ import numpy as np
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.laws import CONDITIONAL
-from iscat_analysis.instrument.microscope import build_microscope
-from iscat_analysis.instrument.particle_image import ParticleImage
+from iscat_analysis.instrument.particle_image import ParticleImage, build_microscope
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.parameters import settings_of
 from iscat_analysis.optics.pixels import PixelGrid

@@ -18,8 +18,7 @@ from matplotlib.figure import Figure
 
 import iscat_analysis as ia
 from iscat_analysis.instrument.joint_fit import maximise
-from iscat_analysis.instrument.microscope import microscopes, reach_nm
-from iscat_analysis.instrument.particle_image import with_masses
+from iscat_analysis.instrument.particle_image import microscopes, reach_nm, with_masses
 from iscat_analysis.instrument.result import Pictures, make_pictures
 from iscat_analysis.optics.parameters import settings_of
 

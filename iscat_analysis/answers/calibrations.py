@@ -119,7 +119,7 @@ def optics_calibration(
         found = calibrate_movie(
             stack, config, free=free, focus_step_nm=focus_step_nm, progress=progress, notify=notify
         )
-    tell(found.notes, notify)
+    tell([note.text for note in found.notes], notify)
     contents = found.to_dict()
     toml = found.to_toml()
     files = {

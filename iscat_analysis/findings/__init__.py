@@ -8,7 +8,17 @@ that stand in the sentence.  One place prints them, the page sorts them by sever
 
 from __future__ import annotations
 
-from iscat_analysis.findings import bounds, camera, files, particles, results, setup, tables, tracks
+from iscat_analysis.findings import (
+    bounds,
+    camera,
+    files,
+    optics,
+    particles,
+    results,
+    setup,
+    tables,
+    tracks,
+)
 from iscat_analysis.findings.registry import (
     KINDS,
     Finding,
@@ -26,7 +36,26 @@ from iscat_analysis.findings.registry import (
 )
 
 __all__ = [
-    "KINDS", "Finding", "FindingKind", "Findings", "Severity", "Value", "aside", "bounds", "camera",
-    "define", "existing", "files", "particles", "printing", "remark", "results", "setup", "tables",
-    "tracks", "unreported", "warnings_in",
+    "KINDS",
+    "Finding",
+    "FindingKind",
+    "Findings",
+    "Severity",
+    "Value",
+    "aside",
+    "bounds",
+    "camera",
+    "define",
+    "existing",
+    "files",
+    "optics",
+    "particles",
+    "printing",
+    "remark",
+    "results",
+    "setup",
+    "tables",
+    "tracks",
+    "unreported",
+    "warnings_in",
 ]  # fmt: skip

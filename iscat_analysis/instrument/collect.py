@@ -25,8 +25,13 @@ from iscat_analysis.fitting.ranges import (
 )
 from iscat_analysis.inference.counts import choose_noise, conditional, counts_likelihood, poisson
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.instrument.microscope import RINGS_NM, TESTED, build_microscope
-from iscat_analysis.instrument.particle_image import PRIVATE, ParticleImage
+from iscat_analysis.instrument.particle_image import (
+    PRIVATE,
+    RINGS_NM,
+    TESTED,
+    ParticleImage,
+    build_microscope,
+)
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.parameters import (
@@ -60,8 +65,6 @@ SAME_NM = 800.0
 """Nearer than this, and at the same time, two steps are one."""
 
 _KNOWN_APART_NM = (APART_NM, 1600.0, 1300.0, 1000.0, 700.0)
-_STANDS_OUT = 5.0
-"""Times the median signal-to-noise ratio of the brightest, from which one is no standard."""
 
 _PARTS = 8  # of a movie, that are searched where all of it is asked for
 
@@ -203,7 +206,8 @@ def _standards(bright: Sequence[BrightStep]) -> list[BrightStep]:
     if len(bright) < LEAST_IMAGES:
         return list(bright)
     middle = float(np.median([step.snr for step in bright[:LEAST_IMAGES]]))
-    return [step for step in bright if step.snr <= _STANDS_OUT * middle]
+    # times the median signal-to-noise ratio of the brightest, from which one is no standard
+    return [step for step in bright if step.snr <= 5.0 * middle]
 
 
 def _without_repeats(steps: Iterable[BrightStep]) -> list[BrightStep]:

@@ -34,7 +34,6 @@ _HEIGHT_STEP_NM = 20.0  # a fringe is some 200 nm high
 _LEVEL_STEP = 0.5
 _Z = 2  # of what is an image's own
 _DAMPING = (1e-3, 1e8)  # first, and where the search gives up
-_FLAT = 1e-10  # share of the largest eigenvalue below which a direction is not determined
 _TOGETHER = 5  # images of one task; a millisecond each
 
 
@@ -159,7 +158,8 @@ class Asked:
         )
         unit = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
         scaled = information * np.outer(unit, unit)
-        bound = np.linalg.pinv(scaled, rcond=_FLAT, hermitian=True) * np.outer(unit, unit)
+        # share of the largest eigenvalue below which a direction is not determined
+        bound = np.linalg.pinv(scaled, rcond=1e-10, hermitian=True) * np.outer(unit, unit)
         return bound @ score, bound @ scatter @ bound
 
 

@@ -6,11 +6,15 @@ the optics are learned, and the analysis goes on with what was learned.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.metadata import version
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import expit, logsumexp
 
 from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config
@@ -24,27 +28,47 @@ from iscat_analysis.diagnosis import (
     examine_background,
     judge_counts,
 )
-from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.findings import printing
+from iscat_analysis.errors import ConfigError, ContrastError, DataError
+from iscat_analysis.findings import Finding, printing
+from iscat_analysis.findings.optics import (
+    OPTICS_AS_CONFIGURED,
+    OPTICS_LEARNED,
+    OPTICS_NOT_LEARNED,
+    TURNED_PHASE,
+    WRONG_SIGN,
+)
 from iscat_analysis.fitting.ranges import background_mode, frame_ranges, measured_windows
 from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.instrument.collect import bright_particle_images, kind_of, scan_particle_images
-from iscat_analysis.instrument.fit_optics import Collected, none_bright
-from iscat_analysis.instrument.loop import accepted, learn
-from iscat_analysis.instrument.microscope import (
-    REJECTED_P,
+from iscat_analysis.instrument.joint_fit import Neighbours, asked_changes, excess, maximise
+from iscat_analysis.instrument.loop import (
+    StandingAlone,
+    WholeField,
+    accepted,
+    fit_optics,
+    learn,
+    misfit_of,
+    none_bright,
+    seen_in_field,
+)
+from iscat_analysis.instrument.measure import TWIN_GAP
+from iscat_analysis.instrument.particle_image import (
     TESTED,
-    median_p,
+    Build,
+    Collected,
+    ParticleImage,
+    average_particle_images,
+    goodness,
     microscopes,
-    not_alone,
     reach_nm,
     refuse_uncalibratable,
+    rings_of,
+    with_heights,
+    with_masses,
+    with_sign,
 )
-from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.instrument.result import OpticsCalibration
-from iscat_analysis.instrument.score_test import ScoreTest, score_test
-from iscat_analysis.instrument.sources import StandingAlone, WholeField, seen_in_field
 from iscat_analysis.instrument.uneven import (
     EVEN,
     Change,
@@ -53,28 +77,271 @@ from iscat_analysis.instrument.uneven import (
     in_uneven_field,
 )
 from iscat_analysis.movie import Stack
-from iscat_analysis.optics.local import terms_of
+from iscat_analysis.optics.forward import ForwardModel, forward_model, signed_peak
+from iscat_analysis.optics.local import BASES, terms_of
 from iscat_analysis.optics.parameters import (
     FIELD,
     FREE,
     LEAST_IMAGES,
+    Prior,
+    Settings,
     free_groups,
+    free_names,
     heights_free,
     prior_of,
     settings_of,
 )
-from iscat_analysis.records import FloatArray, Progress, Windows, silent
+from iscat_analysis.records import FloatArray, Mapper, Progress, Windows, silent
 from iscat_analysis.search.frames import measure_frames, well_lit
 from iscat_analysis.threads import threads
+from iscat_analysis.trust.systematic import REJECTED_SHARE
 from iscat_analysis.units import count
 
+REJECTED_P = 1e-3
+"""Half of the brightest particles must fit worse than this before the optics are doubted: a few
+that are not alone do not suffice."""
+
+
+_STARTS_NM = tuple(range(-400, 401, 100))  # along each axis; rings are some 200 nm apart
+
+
+_CLEAR = 10.0  # standard errors of χ² by which a wrong microscope would be seen in a picture
+
+
+_DESCRIBED = 0.1  # of that, which a picture that is described has at most
+
+
+def median_p(
+    images: list[ParticleImage],
+    config: Config,
+    others: Sequence[ParticleImage] = (),
+    mapper: Mapper = map,
+) -> tuple[float, Sequence[ParticleImage]]:
+    """Give the median p-value of the brightest particles in the configured microscope.
+
+    The rings of neighbours, where any are known, are put into the pictures that fail without.
+    Particles whose heights are open stand at the height that most of them tell.
+    """
+    settings = settings_of(config)
+    build = microscopes(config, max(map(reach_nm, images)) + math.sqrt(2) * _STARTS_NM[-1])
+    model = build(settings)
+    shown: Sequence[ParticleImage] = images[:TESTED]
+    x, y = 0.0, 0.0
+    if not heights_free(config):
+        averages, shown = average_particle_images(shown)
+        x, y = _centre(averages[0], model, build, settings)
+
+    def median(pictures: Sequence[ParticleImage]) -> tuple[float, Sequence[ParticleImage]]:
+        fitted = maximise(pictures, build, settings, (), mapper=mapper).images
+        return float(np.median([goodness(image, model)[1] for image in fitted])), fitted
+
+    moved = [image.placed(image.x_nm + x, image.y_nm + y) for image in shown]
+    shown = with_masses(moved, build, settings)
+    if config.particle.height_is_open:
+        free = maximise(with_heights(shown, config), build, settings, (), mapper=mapper).images
+        middle = float(np.median([image.z_nm for image in free]))
+        shown = [replace(image, z_nm=middle) for image in shown]
+    found, fitted = median(shown)
+    if found >= REJECTED_P or not any(image.neighbours for image in fitted):
+        return found, fitted
+    elsewhere = [other.placed(other.x_nm + x, other.y_nm + y) for other in others]
+    near = Neighbours.fitted(elsewhere, build, rings_of(config, images[0]), settings, mapper)
+    return max((found, fitted), median(near.around(fitted, mapper)), key=lambda each: each[0])
+
+
+def not_alone(
+    images: Sequence[ParticleImage],
+    config: Config,
+    others: Sequence[ParticleImage] = (),
+    mapper: Mapper = map,
+) -> tuple[list[int], float]:
+    """Find bright places that the configured microscope describes badly, and others well.
+
+    A microscope that is wrong is so for all particles, and is seen the better the brighter they
+    are.  Where some as bright are described, the places that are not show two that landed at once.
+    From a place that others drew aside a fit ends in another optimum: each begins anew here.
+    """
+    settings = settings_of(config)
+    build = microscopes(config, max(map(reach_nm, images)) + math.sqrt(2) * _STARTS_NM[-1])
+    model = build(settings)
+
+    def fitted(image: ParticleImage) -> ParticleImage:
+        x, y = _centre(image, model, build, settings)
+        (placed,) = with_masses([image.placed(x, y)], build, settings)
+        return maximise([placed], build, settings, ()).images[0]
+
+    some = list(mapper(fitted, images[:TESTED]))
+    if any(image.neighbours for image in some):
+        near = Neighbours.fitted(others, build, rings_of(config, some[0]), settings, mapper)
+        pictures = near.around(some, mapper)
+        some = list(maximise(pictures, build, settings, (), mapper=mapper).images)
+    chi2, p = np.transpose([goodness(image, model) for image in some])
+    mass = np.array([image.mass_kda for image in some])
+    poor = p < REJECTED_P
+    if not poor.any() or poor.all():
+        return [], float(np.median(p))
+    expected = float(np.median((chi2 - 1)[poor] / mass[poor] ** 2)) * mass**2
+    clear = expected > _CLEAR * np.sqrt(2 / math.prod(some[0].grid.shape))
+    described = ~poor & clear & (chi2 - 1 < _DESCRIBED * expected)
+    # of the pictures, that must be described where others are not
+    if described.sum() < max(2, 0.25 * len(some)):
+        return [], float(np.median(p))
+    return np.flatnonzero(poor).tolist(), float(np.median(p[~poor]))
+
+
+def _centre(
+    image: ParticleImage,
+    model: ForwardModel,
+    build: Callable[[Settings], ForwardModel],
+    settings: Settings,
+) -> tuple[float, float]:
+    """Find the particle in a picture [nm], whose brightest spot may be of a ring.
+
+    From a place half a ring away a fit ends in another optimum, with the mass of the other sign.
+    """
+    image = image.placed(image.x_nm, image.y_nm)
+    starts = [image.placed(image.x_nm + x, image.y_nm + y) for x in _STARTS_NM for y in _STARTS_NM]
+
+    def misfit(one: ParticleImage) -> float:
+        return goodness(one, model)[0]
+
+    likely = sorted(with_masses(starts, build, settings), key=misfit)[:3]  # of these starts
+    fits = [maximise([image], build, settings, ()).images[0] for image in likely]
+    best = min(fits, key=misfit)
+    return best.x_nm, best.y_nm
+
+
+@dataclass(frozen=True)
+class ScoreTest:
+    """Change of the optics that the sum of scores asks for, and the evidence for it.
+
+    Each image has a score and an information of the optics, with its own parameters (place, mass,
+    level) eliminated.  The prior of the change of the optics is normal with covariance P, the
+    square of the usual error of each parameter.  For scores that sum to S with information I, the
+    change has the posterior mean CS with C = (P⁻¹ + I)⁻¹, and optics that are off are by the factor
+
+        B = exp(½ SᵀCS) / √det(1 + PI)
+
+    likelier than those that are right (R. E. Kass, A. E. Raftery, J. Am. Stat. Assoc. 90, 773
+    (1995)). One parameter may be off, or all: B is the mean over these, of which all are as likely
+    before. The remaining doubt about the optics is an error of all masses: the width C of what
+    prior and images leave, and the change CS, whose square counts with the probability B/(1 + B)
+    that there is one.
+
+    Images that show something else, such as two particles at once, disagree with each other.
+    Scores and information are divided by the ratio of the scatter of the scores to that expected
+    from the information.
+
+    Shapes: `change` (n,), `covariance` (n, n).
+    """
+
+    names: tuple[str, ...]
+    values: tuple[float, ...]
+    """As configured."""
+
+    change: FloatArray
+    covariance: FloatArray
+    log_bayes_factor: float
+    """Of optics that are off, over the configured ones."""
+
+    left_over: float
+    """Part of the images that the change explains, over the images (root mean square), with the
+    probability of a change as a factor of its square."""
+
+    field_px: tuple[float, float, float] | None = None
+    """Centre x, y and half the longer side of the field that its terms refer to."""
+
+    @property
+    def rejected(self) -> bool:
+        """Whether other optics are clearly likelier, and different enough to change masses."""
+        return self.log_bayes_factor > TWIN_GAP and self.left_over > REJECTED_SHARE
+
+    @property
+    def posterior(self) -> FloatArray:
+        """Covariance of errors that the configured optics may have after the test, (n, n)."""
+        off = float(expit(self.log_bayes_factor))
+        return np.asarray(self.covariance + off * np.outer(self.change, self.change))
+
+
+def score_test(
+    images: Sequence[ParticleImage],
+    build: Build,
+    settings: Settings,
+    prior: Prior,
+    terms: Sequence[str] = (),
+    mapper: Mapper = map,
+) -> ScoreTest:
+    """Test the optics by images that were each fitted with the configured optics.
+
+    `terms` are coefficients of the field that are tested beside the optics.
+    """
+    names = (*free_names(tuple(FREE), settings, FREE["zernike"]), *terms)
+    usual = prior.errors(names)
+    size, count = len(names), len(images)
+    score, information = np.zeros((count, size)), np.zeros((count, size, size))
+    if count:
+        bases = tuple(dict.fromkeys(base for name in names for base in BASES.get(name, (name,))))
+        asked = asked_changes(images, build, settings, bases, mapper)
+        slopes = np.array(
+            [
+                [[image.slopes(name).get(base, 0.0) for base in bases] for name in names]
+                for image in images
+            ]
+        )
+        score = np.einsum("nik,nk->ni", slopes, asked.score) * usual
+        information = np.einsum("nik,nkl,njl->nij", slopes, asked.information, slopes)
+        information *= np.outer(usual, usual)
+    total, asks = information.sum(axis=0), score.sum(axis=0)
+    change = np.linalg.solve(np.eye(size) + total, asks)
+    # residual scores, which no common change of the optics explains
+    disagreement = excess(total, score - information @ change, np.arange(count))
+    widened = max(disagreement, 1.0)
+    total, asks = total / widened, asks / widened
+    spread = np.linalg.inv(np.eye(size) + total)
+    change = spread @ asks
+    gains, explains = np.transpose(
+        [
+            _alternative(total[np.ix_(free, free)], asks[free])
+            for free in (*np.arange(size)[:, None], np.arange(size))
+        ]
+    )
+    gain = float(logsumexp(gains)) - math.log(len(gains))
+    power = math.fsum(image.snr**2 for image in images)
+    explained = float(expit(gain)) * explains[np.argmax(gains)]
+    left_over = math.sqrt(explained / power) if power else 0.0
+    values = tuple(float(settings.get(name, 0.0)) for name in names)
+    covariance = spread * np.outer(usual, usual)
+    return ScoreTest(names, values, usual * change, covariance, gain, left_over)
+
+
+def _alternative(information: FloatArray, asks: FloatArray) -> tuple[float, float]:
+    """Give log B of other optics, and what their change explains of the images."""
+    posterior = np.eye(asks.size) + information
+    change = np.linalg.solve(posterior, asks)
+    gain = 0.5 * float(asks @ change) - 0.5 * float(np.linalg.slogdet(posterior)[1])
+    return gain, max(float(change @ information @ change), 0.0)
+
+
 _MANY = 4  # particles alone, with fewer of which a field is looked at as a whole
+
+
 _MOST_STEP_NM = 5e3  # farther than the model's pictures reach
-_LEAST_SCAN_NM = 10.0  # over all frames; a step in µm stays below it
+
+
 NOISE = "its noise is not what the camera's numbers predict"
 """Why optics are not judged where p-values cannot be."""
 
+
+_NOT_TESTED = "the optics cannot be tested on this movie"
 _STUCK = 0.02  # share of frames that repeat another, which sums of frames count
+
+
+class Learned(NamedTuple):
+    """The optics of an analysis, what the summary says of them, and what was found."""
+
+    config: Config
+    summary: dict[str, Any]
+    findings: tuple[Finding, ...] = ()
 
 
 def learn_optics(
@@ -82,34 +349,37 @@ def learn_optics(
     config: Config,
     camera: Camera,
     *,
-    warn: Callable[[str], None],
     notify: Callable[[str], None] = notify_nobody,
     opening: NoiseSurvey | None = None,
-) -> tuple[Config, dict[str, Any]]:
+) -> Learned:
     """Test the configured optics on the brightest particles, and learn them where they fail."""
     optics = config.optics
     reason = why_not(config)
     if reason and optics.calibrate == "always":
-        warn(f"the optics are not learned {reason}; the analysis goes on as configured")
+        return Learned(config, {}, (OPTICS_NOT_LEARNED({"reason": reason}),))
     if (
         reason
         or config.fit.mode == "track"  # which learns from its tracks
         or optics.calibrate == "never"
         or (optics.calibrate == "auto" and (optics.file is not None or terms_of(optics)))
     ):
-        return config, {}
+        return Learned(config, {})
     tested: Tested | None = None
+
+    def as_configured(reason: str, verdict: str = "") -> Learned:
+        finding = OPTICS_AS_CONFIGURED({"verdict": verdict or _verdict(tested), "reason": reason})
+        summary = {**(tested.summary if tested else {}), "calibrated": False, "reason": reason}
+        return Learned(config, summary, (finding,))
+
     with threads(config.compute.workers) as pool:
         try:
             tested = tested_optics(movie, config, camera, pool, opening)
             passed = optics.calibrate == "auto" and not tested.rejected
             if passed and tested.particles and not tested.change.matters:
-                return config, tested.summary | {"calibrated": False}
+                return Learned(config, tested.summary | {"calibrated": False})
             if optics.calibrate == "auto" and noise_differs(movie, config, camera):
                 tested = replace(tested, together=_together((), config, pool))
-                reason = f"{NOISE}; the analysis goes on as configured"
-                warn(f"the optics cannot be tested on this movie: {reason}")
-                return config, tested.summary | {"calibrated": False, "reason": reason}
+                return as_configured(NOISE, _NOT_TESTED)
             if not tested.particles:
                 raise DataError(none_bright(movie.name))
             notify("learning the optics from the particles of the movie, which may take minutes…")
@@ -118,19 +388,18 @@ def learn_optics(
                 view = FieldOfView.of(movie, config, in_time=background_mode(config) == "sliding")
                 moved = in_uneven_field(tested.seen, settings_of(config), view, pool.map)
                 if moved is None:  # pictures that were not fitted want no change
-                    return config, tested.summary | {"calibrated": False}
+                    return Learned(config, tested.summary | {"calibrated": False})
                 known = StandingAlone(moved, pool)
                 found = learn(known, config, tuple(FREE), origin, pool.map).outcome
             else:
                 found = learned_from(tested.seen, movie, config, camera, tuple(FREE), origin, pool)
         except DataError as error:
             changing = tested is not None and tested.change.matters
-            reason = f"{error}; {tested.change.said}" if tested and changing else str(error)
-            warn(f"{_verdict(tested)}: {reason}; the analysis goes on as configured")
-            summary = tested.summary if tested else {}
-            return config, summary | {"calibrated": False, "reason": reason}
+            return as_configured(
+                f"{error}; {tested.change.said}" if tested and changing else str(error)
+            )
     verdict = tested.change.said if passed else _verdict(tested)
-    return adopted(found, config, tested.summary, verdict, warn=warn)
+    return adopted(found, config, tested.summary, verdict)
 
 
 @dataclass(frozen=True)
@@ -277,35 +546,28 @@ def adopted(
     verdict: str,
     *,
     picture_of: str = "particle",
-    warn: Callable[[str], None],
-) -> tuple[Config, dict[str, Any]]:
+) -> Learned:
     """Use what was learned, where it may be used, and say so."""
     learned, why = accepted(found, config)
     if learned is None:
-        warn(f"{verdict}: {why}; the analysis goes on as configured")
-        return config, {**tested, **_told(found), "calibrated": False, "reason": why}
+        summary = {**tested, **_told(found), "calibrated": False, "reason": why}
+        said = OPTICS_AS_CONFIGURED({"verdict": verdict, "reason": why})
+        return Learned(config, summary, (said,))
     if learned.optics.reference_phase_deg != found.config.optics.reference_phase_deg:
         found = found.with_phase(learned.optics.reference_phase_deg, _turned(config))
-    headline = found.headline(picture_of)
-    warn(f"optics learned from the movie, instead of the configured ones: {headline}")
-    for note in found.notes:
-        warn(note)
+    said = OPTICS_LEARNED({"headline": found.headline(picture_of)})
     values = [found.value(name) for name in found.names]
     errors = _with_errors(found.names, values, found.covariance, learned.optics.field_px)
-    return learned, {**tested, **_told(found), **errors, "calibrated": True}
+    summary = {**tested, **_told(found), **errors, "calibrated": True}
+    return Learned(learned, summary, (said, *found.notes))
 
 
-def _turned(config: Config) -> str:
+def _turned(config: Config) -> Finding:
     """Say why the phase is not the one that was found, and what that may mean for masses."""
     line = config.calibration
-    wanted, found = "brighten", "darken"
-    if line is not None and line.gradient_per_kda < 0:
-        wanted, found = found, wanted
-    return (
-        f"the phase is half a turn from the one that was found, with which particles {found} the "
-        f"image: by calibration.gradient_per_kda they {wanted} it; if that sign is wrong, so is "
-        "that of every mass"
-    )
+    dark = line is not None and line.gradient_per_kda < 0
+    expected, found = ("darken", "brighten") if dark else ("brighten", "darken")
+    return TURNED_PHASE({"expected": expected, "found": found})
 
 
 def calibrate_movie(
@@ -348,7 +610,7 @@ def _check_step(step_nm: float, frames: int) -> None:
     """Refuse steps that make no scan: another unit is likely."""
     number_in("`focus_step_nm`", step_nm, least=-_MOST_STEP_NM, most=_MOST_STEP_NM)
     travel = abs(step_nm) * (frames - 1)
-    if travel < _LEAST_SCAN_NM:
+    if travel < 10.0:  # over all frames; a step in µm stays below it
         raise ConfigError(
             f"`focus_step_nm` = {step_nm:g}: over {count(frames, 'frame')} the focus rises by "
             f"{travel:.3g} nm, which no picture shows; give the step from frame to frame in nm"
@@ -396,7 +658,7 @@ def noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
 def _verdict(tested: Tested | None) -> str:
     """Say what the test found where the optics are not learned."""
     if tested is None or not tested.particles:
-        return "the optics cannot be tested on this movie"
+        return _NOT_TESTED
     if not tested.rejected:
         return "the optics cannot be learned from this movie"
     why = f"median p-value {tested.median_p:.1g}"
@@ -413,3 +675,160 @@ def _told(found: OpticsCalibration) -> dict[str, Any]:
     """Give what the summary says of a calibration."""
     told = found.to_dict()
     return {key: told[key] for key in ("accepted", "refusals", "parameters", "twin", "notes")}
+
+
+_FOCI_NM = tuple(float(focus) for focus in range(-800, 801, 50))
+
+
+@dataclass(frozen=True)
+class WrongSign:
+    """A configured focus that gives the contrast the other sign.
+
+    The line of a calibration has a sign, and so has the contrast of a particle at a focus.  Between
+    the foci of either sign lie those with next to no contrast.  At a focus of the other sign no
+    mass belongs to a contrast, and nothing can be fitted: the movie must say where the focus is.
+    """
+
+    config: Config
+    finding: Finding
+    starts: tuple[Config, ...]
+
+    def error(self, why: str) -> ConfigError:
+        """Say that nothing can be fitted, and why the movie does not help."""
+        return ConfigError(
+            f"{self.finding.text}; {why}: correct optics.focus_nm, or "
+            "calibration.gradient_per_kda if that has the wrong sign"
+        )
+
+
+def wrong_sign(config: Config) -> WrongSign | None:
+    """Tell whether the configured optics give contrast the sign that the calibration has."""
+    if config.calibration is None or config.optics.psf != "model":
+        return None
+    try:
+        forward_model(config, 1000.0)
+    except ContrastError:
+        pass
+    else:
+        return None
+    line = config.calibration.gradient_per_kda
+    foci = sorted({*_FOCI_NM, config.optics.focus_nm})
+    contrast = {focus: _contrast(_at(config, focus)) for focus in foci}
+    here = contrast[config.optics.focus_nm]
+    most = max(foci, key=lambda focus: abs(contrast[focus]))
+    share = abs(here / contrast[most])
+    they = "are"
+    # contrast over the largest of any focus, below which the focus is one between both signs
+    if share < 0.3:
+        they = f"have next to no contrast ({share:.0%} of that at {most:g}), and what they have is"
+    shown, expected = ("bright", "dark") if here > 0 else ("dark", "bright")
+    finding = WRONG_SIGN(
+        {"focus_nm": config.optics.focus_nm, "shown": f"{they} {shown}", "gradient_per_kda": line,
+         "expected": expected}
+    )  # fmt: skip
+    # of the largest contrast, which a focus to begin with has
+    fair = [f for f in foci if contrast[f] * line > 0 and abs(contrast[f] / contrast[most]) > 0.2]
+    starts = [focus for focus in fair if focus % 100.0 == 0]  # foci to begin with
+    return WrongSign(config, finding, tuple(_at(config, focus) for focus in starts))
+
+
+def learn_sign(
+    movie: Stack,
+    wrong: WrongSign,
+    camera: Camera,
+    *,
+    notify: Callable[[str], None] = notify_nobody,
+    opening: NoiseSurvey | None = None,
+) -> Learned:
+    """Learn the optics of a movie whose configured focus has the wrong sign, or its focus alone."""
+    config = wrong.config
+    reason = why_not(config)
+    if reason:
+        raise wrong.error(f"the optics are not learned {reason}")
+    if config.fit.mode == "track":
+        raise wrong.error(
+            "no track can be followed with it, from which the optics would be learned"
+        )
+    if config.optics.calibrate == "never" or (
+        config.optics.calibrate == "auto" and config.optics.file is not None
+    ):
+        by = "file" if config.optics.calibrate == "auto" else "calibrate"
+        value = getattr(config.optics, by)
+        raise wrong.error(f'by optics.{by} = "{value}" the optics are not learned from the movie')
+    notify("learning the optics from the particles of the movie, which may take minutes…")
+    with threads(config.compute.workers) as pool:
+        try:
+            if noise_differs(movie, config, camera):
+                raise DataError("the movie does not tell another: " + NOISE)
+            if heights_free(config):
+                seen = _begun(movie, wrong, camera, pool)
+            else:
+                images, others = bright_particle_images(movie, config, camera, pool, opening)
+                seen = Collected(config, images, others)
+            if not seen.images:
+                raise DataError(none_bright(movie.name))
+            median, _ = median_p(list(seen.images), config, seen.others, pool.map)
+            if median >= REJECTED_P:
+                raise DataError("with it the optics describe the particles of the movie")
+            found = _found(movie, seen, wrong, camera, pool)
+        except DataError as error:
+            raise wrong.error(str(error)) from error
+    tested = {"tested": len(seen.images), "median_p": median}
+    learned = adopted(found, config, tested, wrong.finding.text)
+    return learned._replace(findings=(wrong.finding, *learned.findings))
+
+
+def _begun(movie: Stack, wrong: WrongSign, camera: Camera, pool: ThreadPoolExecutor) -> Collected:
+    """Fit the field with each focus of the right sign, and take what describes most particles."""
+    config = wrong.config
+    windows = measured_windows(movie, config, camera, *frame_ranges(movie, config))
+    best: tuple[float, Collected] | None = None
+    for start in wrong.starts:
+        images, others = seen_in_field(windows, start, pool)
+        if not images:
+            continue
+        model = microscopes(start, max(map(reach_nm, images)))(settings_of(start))
+        chi2 = float(np.median([goodness(image, model)[0] for image in images]))
+        if best is None or chi2 < best[0]:
+            best = chi2, Collected(config, images, others, settings_of(start))
+    return best[1] if best is not None else Collected(config, ())
+
+
+def _found(
+    movie: Stack, seen: Collected, wrong: WrongSign, camera: Camera, pool: ThreadPoolExecutor
+) -> OpticsCalibration:
+    """Measure the focus alone, or where that does not describe the particles all of the optics."""
+    config, origin = wrong.config, {"movie": movie.name}
+    found = fit_optics(seen, ("focus",), origin, pool.map)
+    focus = float(str(found.measured.settings["focus_nm"]))
+    if found.accepted:
+        learned, _ = with_sign(found.config)
+        if learned is None or _phase(learned) != _phase(config):
+            raise DataError(f"by the movie the focus is {focus:.0f} nm, which has that sign too")
+        return found
+    if heights_free(config):
+        near = replace(seen, near=found.measured.settings)
+        every = fit_optics(near, tuple(FREE), origin, pool.map)
+    else:
+        every = learned_from(seen, movie, config, camera, tuple(FREE), origin, pool)
+    if accepted(every, config)[0] is not None:
+        return every
+    chi2 = misfit_of(found)
+    more = "" if heights_free(config) else ", as where more than the focus is wrong"
+    raise DataError(
+        f"of the foci tried {focus:.0f} nm describes the brightest particles best, but not well "
+        f"(reduced chi2 {chi2:.3g}){more}"
+    )
+
+
+def _phase(config: Config) -> float:
+    return config.optics.reference_phase_deg
+
+
+def _at(config: Config, focus_nm: float) -> Config:
+    optics = config.optics.model_copy(update={"focus_nm": focus_nm})
+    return config.model_copy(update={"optics": optics})
+
+
+def _contrast(config: Config) -> float:
+    return signed_peak(forward_model(config.model_copy(update={"calibration": None}), 1000.0))

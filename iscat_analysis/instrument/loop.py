@@ -13,31 +13,312 @@ round changes than the one before, and with it what is still to come.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
-from iscat_analysis.config import Config
+from iscat_analysis.config import MOVES, Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.instrument.fit_optics import Collected, fit_optics
-from iscat_analysis.instrument.microscope import with_sign
-from iscat_analysis.instrument.result import OpticsCalibration
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.optics import ODD_APERTURE
+from iscat_analysis.fitting.context import make_context
+from iscat_analysis.fitting.field import fit_field
+from iscat_analysis.instrument.collect import bright_places, known_places
+from iscat_analysis.instrument.joint_fit import Neighbours, maximise
+from iscat_analysis.instrument.measure import FOCUS_STEP_NM, TWIN_GAP, Measured, OpticsSearch
+from iscat_analysis.instrument.particle_image import (
+    Collected,
+    ParticleImage,
+    goodness,
+    microscopes,
+    reach_nm,
+    rings_of,
+    with_masses,
+    with_sign,
+)
+from iscat_analysis.instrument.result import OpticsCalibration, make_pictures, make_result
+from iscat_analysis.instrument.uneven import FieldOfView, asked_change, in_uneven_field
+from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.parameters import (
+    FIELD,
+    FOCUS_STEP,
+    FREE,
+    LEAST_IMAGES,
     Settings,
     change_of,
+    free_names,
+    heights_free,
     optics_limits,
+    prior_of,
     settings_of,
     with_settings,
 )
-from iscat_analysis.records import FloatArray, Mapper
+from iscat_analysis.records import FloatArray, Mapper, Status, Windows
+
+STEP_FACTORS = (0.5, 2.0)
+"""How much smaller or larger than said the steps of a scan may turn out."""
+
+
+_FOCUS_MOVES_NM = tuple(FOCUS_STEP_NM * i for i in (0, -1, 1, -2, 2, -3, 3))
+
+
+_TURNS = 2  # of heights of neighbours, and of their rings
+
+
+_OPTICS_PASSES = 8
+
+
+_LEADERS = 2  # microscopes that are followed beside the configured one,
+
+
+_FOLLOWED = 3  # for so many rounds,
+
+
+_CLEAR = 1.0  # unless one describes the pictures to so many standard errors of one picture's χ²
+
+
+_ODD_SIGMAS = 5.0
+
+
+def fit_optics(
+    seen: Collected, groups: Sequence[str], origin: Mapping[str, str], mapper: Mapper = map
+) -> OpticsCalibration:
+    """Fit the optics to pictures; where each particle has a height of its own, with all heights.
+
+    Such pictures differ, so that nothing can be averaged.  A wrong focus has moved all their
+    heights, to other fringes too: foci around the configured one are tried, with every particle at
+    the height that suits it best among the rings of all.
+    """
+    free = any(image.heights_nm is not None for image in seen.images)
+    start = replace(seen, near=settings_of(seen.config)) if free and seen.near is None else seen
+    found = _fitted(start, groups, origin, mapper)
+    # of pictures that were not fitted, from which no other is looked for
+    if not free or seen.near is not None or (found.accepted and misfit_of(found) < 1.2):
+        return found
+    begun = _likeliest(start, groups, mapper)
+    other = _fitted(
+        replace(seen, images=begun.images, others=begun.others, near=begun.settings),
+        groups,
+        origin,
+        mapper,
+    )
+    return min(found, other, key=lambda one: (not one.accepted, misfit_of(one)))
+
+
+def none_bright(name: str) -> str:
+    """Say that nothing tells the optics, and what would."""
+    return (
+        f"{name}: shows no bright particle that stands alone, from which the optics would be "
+        "learned; record brighter ones (20 nm gold, or protein of 400 kDa and more), or more "
+        "photons per frame"
+    )
+
+
+def misfit_of(found: OpticsCalibration) -> float:
+    """Give the mean reduced χ² of pictures that were not fitted."""
+    return float(found.measured.judgement.chi2_reduced.mean())
+
+
+def _fitted(
+    seen: Collected, groups: Sequence[str], origin: Mapping[str, str], mapper: Mapper
+) -> OpticsCalibration:
+    """Measure the microscope and put the result together."""
+    config, images = seen.config, seen.images
+    if not images:
+        raise DataError(none_bright(origin["movie"]))
+    configured = settings_of(config)
+    limits = optics_limits(config.optics.n_immersion, config.optics.n_glass)
+    if seen.focus_step_nm is not None:
+        configured[FOCUS_STEP] = seen.focus_step_nm
+        low, high = sorted(factor * seen.focus_step_nm for factor in STEP_FACTORS)
+        limits[FOCUS_STEP] = (low, high)
+    near = seen.near or {}
+    configured |= {name: 0.0 for name in (*MOVES, *FIELD) if name in near}
+    build = microscopes(config, max(map(reach_nm, images)))
+    focus = config.optics.focus_nm
+    search = OpticsSearch(
+        configured,
+        build,
+        groups,
+        limits,
+        prior_of(config, configured),
+        side=int(math.copysign(1, focus)) if focus else 0,
+        others=seen.others,
+        build_wide=rings_of(config, images[0]),
+        known=seen.near,
+        mapper=mapper,
+    )
+    measured = search.run(images)
+    if seen.refusal:
+        measured = replace(measured, refusals=(*measured.refusals, seen.refusal))
+    estimate = measured.estimate
+    pictures = make_pictures(estimate.images, build, estimate.values)
+    notes = _on_the_pixel(search, config, measured)
+    return make_result(config, configured, measured, pictures, origin, notes)
+
+
+def _on_the_pixel(search: OpticsSearch, config: Config, measured: Measured) -> tuple[Finding, ...]:
+    """Say that the pixels may be wrong where the aperture is another than the configured one.
+
+    Pictures of a smaller aperture are wider, and so are those whose pixels are said to be too
+    large.  Light beyond the critical angle tells both apart, and does not widen as the rest does:
+    the size is fitted, with the aperture as configured, and named unless it is ruled out.
+    """
+    from scipy.optimize import minimize_scalar
+
+    estimate, pixel = measured.estimate, config.camera.pixel_size_nm
+    if "na" not in estimate.names or pixel is None:
+        return ()
+    k = estimate.names.index("na")
+    engraved, values = search.configured["na"], estimate.values
+    apart = values["na"] - engraved
+    # between the aperture of an objective and what is engraved on it
+    if abs(apart) < max(0.02, _ODD_SIGMAS * math.sqrt(estimate.covariance[k, k])):
+        return ()
+    most = (values["na"] / engraved) ** 2  # apertures change by half of what pixels do, or more
+    build = microscopes(config, max(1.0, most) * max(map(reach_nm, estimate.images)))
+
+    def misfit(factor: float) -> float:
+        fit = maximise(
+            [image.stretched(factor) for image in estimate.images],
+            build,
+            {**values, "na": engraved},
+            [name for name in estimate.names if name != "na"],
+            prior=search.prior, limits=search.limits, passes=_OPTICS_PASSES, mapper=search.mapper,
+        )  # fmt: skip
+        return estimate.log_likelihood - fit.log_likelihood
+
+    found = minimize_scalar(
+        # to which the size of pixels is looked for, over that size
+        misfit,
+        bounds=sorted((1.0, most)),
+        method="bounded",
+        options={"xatol": 1e-3},
+    )
+    if found.fun > TWIN_GAP:
+        return ()
+    sizes = {"pixel_nm": float(found.x) * pixel, "configured_nm": pixel}
+    return (ODD_APERTURE({"difference": apart, **sizes}),)
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """A microscope, and all particles at the heights that suit it best."""
+
+    settings: Settings
+    images: list[ParticleImage]
+    others: list[ParticleImage]
+    misfit: float
+
+
+def _likeliest(seen: Collected, groups: Sequence[str], mapper: Mapper) -> _Begun:
+    """Look for the microscope to begin with around the one that is near.
+
+    The foci and lights that suit the pictures best are followed for some rounds of optics, and of
+    heights and rings in them.  Where particles are at one height this is done on the average of
+    their pictures.
+    """
+    config, known = seen.config, dict(seen.near or {})
+    images, others = seen.images, seen.others
+    optics = config.optics
+    limits = optics_limits(optics.n_immersion, optics.n_glass)
+    build = microscopes(config, max(map(reach_nm, images)))
+    build_wide = rings_of(config, images[0])
+    lights = ("linear", "circular") if "polarization" in groups else (known["polarization"],)
+    focus_moves = _FOCUS_MOVES_NM if "focus" in groups else (0.0,)
+    # a focus and heights that are one fringe off describe the pictures nearly as well
+    clear = 1 + _CLEAR * math.sqrt(2 / math.prod(images[0].grid.shape))
+
+    def placed(
+        settings: Settings,
+        some: Sequence[ParticleImage],
+        around: Sequence[ParticleImage],
+        moved: float = 0.0,
+    ) -> _Begun:
+        model, wide = build(settings), build_wide(settings)
+        fringe = model.fringe_nm
+        anywhere = [moved + fringe * k for k in (-1.0, -0.5, 0.0, 0.5, 1.0)]
+
+        def best(
+            few: Sequence[ParticleImage], shifts: Sequence[float]
+        ) -> list[tuple[float, ParticleImage]]:
+            return _best_heights(few, shifts, model, settings, mapper)
+
+        near = [image for _, image in best(around, anywhere)] if around else []
+        for _ in range(_TURNS if near else 0):  # each among all, whose rings other heights change
+            among = Neighbours(tuple(near), wide).around(near, mapper)
+            near = [image for _, image in best(among, [-fringe, 0.0, fringe])]
+        found = best(Neighbours(tuple(near), wide).around(some, mapper), anywhere)
+        misfit = float(np.median([chi2 for chi2, _ in found]))
+        return _Begun(settings, [image for _, image in found], near, misfit)
+
+    def better(one: _Begun) -> _Begun:
+        names = free_names(groups, one.settings, FREE["zernike"])
+        fit = maximise(
+            one.images, build, one.settings, names, prior=prior_of(config), limits=limits,
+            passes=_OPTICS_PASSES, mapper=mapper,
+        )  # fmt: skip
+        return placed(fit.values, fit.images, one.others)
+
+    tried = [
+        placed(
+            {**known, "polarization": light, "focus_nm": known["focus_nm"] + moved},
+            images, others, moved,
+        )
+        for light in lights for moved in focus_moves
+    ]  # fmt: skip
+    tried.sort(key=lambda begun: begun.misfit)
+    first = next(begun for begun in tried if begun.settings["focus_nm"] == known["focus_nm"])
+    leaders = [first, *(begun for begun in tried[:_LEADERS] if begun is not first)]
+    followed: list[_Begun] = []
+    for begun in leaders:
+        for _ in range(_FOLLOWED):
+            begun = better(begun)
+            followed.append(begun)
+            if begun.misfit < clear:
+                return begun
+    return min([*tried, *followed], key=lambda begun: begun.misfit)
+
+
+def _best_heights(
+    images: Sequence[ParticleImage],
+    shifts_nm: Sequence[float],
+    model: ForwardModel,
+    settings: Settings,
+    mapper: Mapper,
+) -> list[tuple[float, ParticleImage]]:
+    """Fit every image from several heights; give the reduced χ² of the best fit, and that.
+
+    Half a fringe away a particle of the other sign looks much the same, but none leaves here: a fit
+    with the sign that the mass had is preferred.
+    """
+
+    def build(_: Settings) -> ForwardModel:
+        return model
+
+    found: list[list[tuple[bool, float, ParticleImage]]] = [[] for _ in images]
+    for shift in shifts_nm:
+        moved = [image.raised(shift) for image in images]
+        begun = with_masses(moved, build, settings)
+        # of a fit from one of several heights
+        fits = maximise(begun, build, settings, (), passes=12, mapper=mapper).images
+        for image, fit, of_it in zip(images, fits, found, strict=True):
+            turned = image.mass_kda * fit.mass_kda < 0
+            of_it.append((turned, goodness(fit, model)[0], fit))
+    return [min(fits, key=lambda fit: fit[:2])[1:] for fits in found]
+
 
 SETTLED = 1.0
 """Standard errors that are still to come, below which no other round is made."""
 
-_FIRST_SHARE = 0.5  # of an error that a round leaves, where one round says nothing of it
+
 _MOST_SHARE = 0.8
+
+
 _FARTHEST = 0.7  # times the last change that is added to it: some directions change back then
 
 
@@ -174,7 +455,8 @@ class Rounds:
     @property
     def to_come(self) -> FloatArray:
         """Change of the latest parameters that other rounds would make, shape (n,)."""
-        share = _FIRST_SHARE if self.share is None else self.share
+        # of an error that a round leaves, where one round says nothing of it
+        share = 0.5 if self.share is None else self.share
         return self._steps[-1].step * share / (1 - share)
 
     @property
@@ -209,3 +491,102 @@ class Rounds:
 
 def _kind(settings: Settings) -> tuple[object, ...]:
     return settings["polarization"], settings["analyzer"], settings["mask_na"] > 0
+
+
+ROUNDS = 3
+"""Of a fit of the field and optics learned from it."""
+
+
+HOPELESS_CHI2 = 2.0
+"""Reduced χ² of pictures that were not fitted, above which it must have fallen for another round.
+Not more than that: with the first optics heights may be those of two fringes, and the field that is
+fitted with the next ones has a single one."""
+
+
+@dataclass(frozen=True)
+class StandingAlone:
+    """Particles that stand alone.
+
+    They tell besides whether the optics change over the field or while the movie is recorded.
+    """
+
+    seen: Collected
+    pool: ThreadPoolExecutor
+    view: FieldOfView | None = None
+    """Where and when they were seen, if that is asked for."""
+
+    def collect(self, rounds: Rounds) -> Collected | None:
+        """Give all pictures, and once more with their places and times where optics change."""
+        if not rounds.all:
+            return self.seen
+        if self.view is None or len(rounds.all) > 1:
+            return None
+        found, config = rounds.all[0].found.measured, self.seen.config
+        settings, mapper = found.settings, self.pool.map
+        if not asked_change(found.estimate.images, config, settings, self.view, mapper).matters:
+            return None
+        return in_uneven_field(self.seen, settings, self.view, mapper)
+
+    def describes(self, seen: Collected) -> bool:
+        """Say that no optics took part in finding them."""
+        return seen.found_with is None
+
+
+@dataclass(frozen=True)
+class WholeField:
+    """All particles of a field, those that are farthest from others, among the rings of all.
+
+    Particles that stand alone are found without any optics.  Where all bound at once and hardly any
+    stands alone, the optics are learned roughly from bright places, with what is faint or near
+    another not accounted for.  With these optics the field is fitted, and from its particles, now
+    all known, the optics are learned again, until they describe pictures that were not fitted.
+    Particles that each have a height of their own are learned from in the same way, beginning with
+    the field as the configured optics fit it.
+    """
+
+    windows: Windows
+    config: Config
+    pool: ThreadPoolExecutor
+
+    def collect(self, rounds: Rounds) -> Collected | None:
+        """Fit the field with what was learned last."""
+        free = heights_free(self.config)
+        if not rounds.all and not free:
+            images, others = bright_places(self.windows, self.config, alone_nm=0.0)
+            return Collected(self.config, images, others)
+        if rounds.all and self._ended(rounds):
+            return None
+        ahead = rounds.all[-1].ahead if rounds.all else self.config
+        if ahead is None:
+            raise DataError(rounds.all[-1].reason)
+        images, others = seen_in_field(self.windows, ahead, self.pool)
+        near = settings_of(ahead) if free and rounds.all else None
+        return Collected(self.config, images, others, near, found_with=ahead)
+
+    def describes(self, seen: Collected) -> bool:
+        """Tell whether all of the particles are known: bright places alone are seen roughly."""
+        return seen.found_with is not None
+
+    def _ended(self, rounds: Rounds) -> bool:
+        """Tell whether optics are learned, or another round is hopeless."""
+        fitted = [one.found for one in rounds.all if one.described]
+        if not fitted:
+            return False
+        before = misfit_of(fitted[-2]) if len(fitted) > 1 else math.inf
+        before = min(before, float(fitted[-1].measured.configured.chi2_reduced.mean()))
+        hopeless = misfit_of(fitted[-1]) > max(HOPELESS_CHI2, before)
+        return fitted[-1].accepted or hopeless or len(fitted) == ROUNDS
+
+
+def seen_in_field(
+    windows: Windows, config: Config, pool: ThreadPoolExecutor
+) -> tuple[list[ParticleImage], list[ParticleImage]]:
+    """Fit the field, and cut out the particles that are farthest from others."""
+    free = heights_free(config)
+    fit = config.fit.model_copy(update={"mode": "joint" if free else "mass"})
+    rows, columns = windows.after_e.shape
+    context = make_context(config.model_copy(update={"fit": fit}), (rows, columns))
+    events, _ = fit_field(context, windows, pool=pool)
+    # with free heights what wrong optics leave over is beside particles, which would not be alone
+    known = [e.fit.theta for e in events if not (free and Status.SIDELOBE in e.flags)]
+    return known_places(windows, config, known, LEAST_IMAGES)

@@ -9,17 +9,23 @@ from typing import Any, Protocol
 import numpy as np
 from scipy import ndimage
 
+from iscat_analysis.config import Config, refuse_rod
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.fit import goodness_of_fit
+from iscat_analysis.inference.heights import height_prior
 from iscat_analysis.inference.laws import CONDITIONAL, NoiseLaw
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.optics.forward import ForwardModel, peak_per_amplitude
+from iscat_analysis.last_used import memoize
+from iscat_analysis.optics.forward import ForwardModel, forward_model, peak_per_amplitude
 from iscat_analysis.optics.local import WEIGHTS, Spot, changes_at
-from iscat_analysis.optics.parameters import FOCUS_STEP, Settings
+from iscat_analysis.optics.parameters import FOCUS_STEP, Settings, heights_free, with_settings
 from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.records import BoolArray, FloatArray
 
 PRIVATE = 5
 """Unknowns of one image, as `Likelihood` has them: x, y, z [nm], mass [kDa], logarithm of the
 background level."""
+
 
 ROAM_NM = 300.0
 """Farthest from the centre of a picture that its particle may be, along x and y."""
@@ -167,9 +173,13 @@ def models_of(
 
 UNIT_KDA = 1e3  # at which interference and scattered light are told apart, by their powers
 
-_FOCI = 7  # of a scan, whose averages are searched
+
 _ROUNDS = 3  # of registration
+
+
 _PARTS = 20  # of a pixel, to which it is found
+
+
 FARTHEST_CENTRE_PX = 4.0  # a picture's first centre is off by no more
 
 
@@ -254,7 +264,8 @@ def average_particle_images(
         for i, image in zip(members, group, strict=True):
             placed[i] = image
     offsets = list(averages)
-    chosen = np.unique(np.linspace(0, len(offsets) - 1, min(_FOCI, len(offsets))).round())
+    # of a scan, whose averages are searched
+    chosen = np.unique(np.linspace(0, len(offsets) - 1, min(7, len(offsets))).round())
     return tuple(averages[offsets[int(i)]] for i in chosen), tuple(placed)
 
 
@@ -351,3 +362,114 @@ def signal_of(
     """
     likelihood = Likelihood(nominal, image.grid, image.noise, image.data)
     return np.nan_to_num(likelihood.measured_signal()), likelihood.signal_information(signal)
+
+
+def build_microscope(config: Config, reach_nm: float, settings: Settings) -> ForwardModel:
+    """Make the forward model of other optics, with the model's own mass scale."""
+    changed = with_settings(config, settings).model_copy(update={"calibration": None})
+    seated = not heights_free(config) and not config.particle.height_is_open
+    highest = config.particle.nominal_height_nm if seated else None
+    return forward_model(changed, reach_nm, z_max_nm=highest)
+
+
+RINGS_NM = 9000.0
+"""Farther than this from a particle its rings are left out."""
+
+
+TESTED = 24
+"""Particles on which optics are tested, the brightest."""
+
+
+def reach_nm(image: ParticleImage) -> float:
+    """Distance from a particle, which may move in its picture, to the farthest pixel."""
+    # how far a particle may lie from the centre of its picture
+    return image.grid.diagonal_nm / 2 + 450.0
+
+
+def refuse_uncalibratable(config: Config) -> None:
+    """Refuse what has no reference to interfere with, or no derivative."""
+    if config.optics.scheme == "darkfield":
+        raise ConfigError(
+            'optics.scheme = "darkfield" has no reference, and the optics are learned from the '
+            "interference with it: calibrate with an interferometric movie of the same microscope"
+        )
+    if config.optics.convention == "dong2021":
+        raise ConfigError('optics.convention = "dong2021" cannot be calibrated: use "exact"')
+    refuse_rod(config, "optics are learned from round particles")
+    if config.particle.is_sphere:
+        raise ConfigError(
+            f'particle.model = "{config.particle.model}": optics are learned from dipoles; record '
+            "some, and give the file with their optics as optics.file"
+        )
+
+
+def microscopes(config: Config, reach_nm: float) -> Callable[[Settings], ForwardModel]:
+    """Make models of changing optics, and keep the last few."""
+
+    def model(items: tuple[tuple[str, Any], ...]) -> ForwardModel:
+        return build_microscope(config, reach_nm, dict(items))
+
+    at_hand = memoize(64, model)  # as many as there are pictures with optics of their own
+    return lambda settings: at_hand(tuple(settings.items()))
+
+
+def rings_of(config: Config, image: ParticleImage) -> Callable[[Settings], ForwardModel]:
+    """Make models as far as rings of neighbours matter."""
+    return microscopes(config, RINGS_NM + image.grid.diagonal_nm)
+
+
+def goodness(image: ParticleImage, model: ForwardModel) -> tuple[float, float]:
+    """Reduced χ² and p-value of a fitted picture."""
+    likelihood = Likelihood(model, image.grid, image.noise, image.data)
+    return goodness_of_fit(likelihood, image.private, image.free)
+
+
+def with_sign(config: Config) -> tuple[Config | None, str]:
+    """Give learned optics the sign of contrast that the calibration of masses has.
+
+    A line between contrast and mass fixes that sign, and with it the reference phase of two that
+    differ by half a turn.
+    """
+    phase = config.optics.reference_phase_deg
+    reason = ""
+    for turned in (phase, (phase + 360) % 360 - 180):
+        update = {"reference_phase_deg": turned, "calibrate": "never", "file": None}
+        learned = config.model_copy(update={"optics": config.optics.model_copy(update=update)})
+        try:
+            forward_model(learned, 1000.0)
+        except ConfigError as error:
+            reason = str(error)
+        else:
+            return learned, ""
+    return None, reason
+
+
+def with_heights(images: Sequence[ParticleImage], config: Config) -> Sequence[ParticleImage]:
+    """Let each particle have its own height, if heights are to be learned from the movie."""
+    prior = height_prior(config, 0.0) if config.particle.height_is_open else None
+    heights = None if prior is None else prior.range_nm
+    return [replace(image, heights_nm=heights or image.heights_nm) for image in images]
+
+
+@dataclass(frozen=True)
+class Collected:
+    """Pictures of particles, and what is known of the microscope that made them."""
+
+    config: Config
+    """As configured: where the search begins, and what stays where pictures do not tell it."""
+
+    images: Sequence[ParticleImage]
+    others: Sequence[ParticleImage] = ()
+    """Particles whose rings are in the pictures."""
+
+    near: Settings | None = None
+    """A microscope near theirs, from which the fit goes on; None: one is looked for."""
+
+    found_with: Config | None = None
+    """Optics with which they were found; None where no optics took part in that."""
+
+    focus_step_nm: float | None = None
+    """Of a scan of the focus."""
+
+    refusal: str = ""
+    """Why no optics describe them, however well they fit."""

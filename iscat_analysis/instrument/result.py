@@ -19,6 +19,14 @@ from iscat_analysis.config import (
     field_keys,
     toml_value,
 )
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.optics import (
+    DROPPED_TERMS,
+    PICTURES_LEFT_OUT,
+    TWIN_OPTICS,
+    UNDECIDED_OPTICS,
+    UNTOLD_OPTICS,
+)
 from iscat_analysis.instrument.measure import Judgement, Measured
 from iscat_analysis.instrument.particle_image import Build, ParticleImage, contrast_of
 from iscat_analysis.optics.local import BEND, DRIFT
@@ -35,9 +43,6 @@ from iscat_analysis.optics.parameters import (
 from iscat_analysis.records import FloatArray
 from iscat_analysis.text import in_toml
 from iscat_analysis.units import count
-
-PUPIL_POINTS = 129
-"""Points across the pupil's picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +98,7 @@ def make_pictures(images: Sequence[ParticleImage], build: Build, settings: Setti
     def ring_mean(image: FloatArray) -> FloatArray:
         return np.asarray(np.bincount(rings[inside], image[inside])[first:] / count[first:])
 
-    axis = np.linspace(-1, 1, PUPIL_POINTS)
+    axis = np.linspace(-1, 1, 129)  # points across the pupil's picture
     rho, phi = np.hypot(axis[:, None], axis), np.arctan2(axis[:, None], axis[None, :])
     disc = rho <= 1
     wavefront = np.zeros(rho.shape)
@@ -132,7 +137,7 @@ class OpticsCalibration:
     pictures: Pictures
     images: int
     source: Mapping[str, str]
-    notes: tuple[str, ...]
+    notes: tuple[Finding, ...]
 
     @property
     def accepted(self) -> bool:
@@ -207,7 +212,7 @@ class OpticsCalibration:
             f"({np.mean(before.chi2_reduced):.3g} as configured)"
         )
 
-    def with_phase(self, phase_deg: float, note: str) -> OpticsCalibration:
+    def with_phase(self, phase_deg: float, note: Finding) -> OpticsCalibration:
         """Take the reference phase half a turn away, which explains the pictures as well."""
         name = "reference_phase_deg"
         parameters = self.parameters.copy()
@@ -272,7 +277,7 @@ class OpticsCalibration:
             "contaminated": found.contaminated,
             "source": dict(self.source),
             "pictures": {k: v.tolist() if hasattr(v, "tolist") else v for k, v in shown.items()},
-            "notes": list(self.notes),
+            "notes": [note.text for note in self.notes],
         }
 
 
@@ -282,7 +287,7 @@ def make_result(
     measured: Measured,
     pictures: Pictures,
     source: Mapping[str, str],
-    notes: Sequence[str] = (),
+    notes: Sequence[Finding] = (),
 ) -> OpticsCalibration:
     """Put a result together, with what else could not be known."""
     estimate = measured.estimate
@@ -342,37 +347,25 @@ def _with_covariance(config: Config, names: tuple[str, ...], covariance: FloatAr
     return config.model_copy(update={"optics": optics})
 
 
-def _notes(measured: Measured, untold: Sequence[str], dropped: Sequence[str]) -> tuple[str, ...]:
+def _notes(
+    measured: Measured, untold: Sequence[str], dropped: Sequence[str]
+) -> tuple[Finding, ...]:
     """Say in words what could not be known."""
-    notes = []
-    if untold:
-        notes.append(
-            f"the pictures tell little or nothing of {', '.join(untold)}: what is configured and "
-            "its usual error ([uncertainty] optics) count, which is part of the error of all masses"
-        )
-    for name in measured.undecided:
-        notes.append(
-            f"the pictures do not tell {name} = true from false; it stays as configured "
-            "(particles of higher contrast would tell)"
-        )
+    notes = [UNTOLD_OPTICS({"names": ", ".join(untold)})] if untold else []
+    notes += [UNDECIDED_OPTICS({"name": name}) for name in measured.undecided]
     if dropped:
-        notes.append(
-            f"{', '.join(dropped)} did not improve {measured.judgement.pictures} and are 0"
-        )
+        pictures = measured.judgement.pictures
+        notes.append(DROPPED_TERMS({"names": ", ".join(dropped), "pictures": pictures}))
     if measured.contaminated:
-        notes.append(
-            f"{count(measured.contaminated, 'picture')} left out, because something else happened "
-            "there"
-        )
+        notes.append(PICTURES_LEFT_OUT({"pictures": count(measured.contaminated, "picture")}))
     twin = measured.twin
     if twin is not None:
+        focus, phase = (twin.settings[key] for key in ("focus_nm", "reference_phase_deg"))
+        lower = "lower" if twin.gap >= 0 else "higher"
         notes.append(
-            f"a twin with focus {twin.settings['focus_nm']:.1f} nm, reference phase "
-            f"{twin.settings['reference_phase_deg']:.1f} deg and the even aberrations reversed "
-            "makes the same pictures (log-likelihood "
-            f"{abs(twin.gap):.1f} {'lower' if twin.gap >= 0 else 'higher'}); the configured side "
-            "of focus was taken. A scan of the focus, particles at several heights or an NA above "
-            "the sample's index would tell them apart"
+            TWIN_OPTICS(
+                {"focus_nm": focus, "phase_deg": phase, "gap": abs(twin.gap), "lower": lower}
+            )
         )
     return tuple(notes)
 

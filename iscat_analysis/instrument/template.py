@@ -30,8 +30,13 @@ from iscat_analysis.fitting.ranges import background_mode
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.instrument.collect import bright_particle_images, kind_of
 from iscat_analysis.instrument.measure import HELD_OUT_P, Judgement, judge
-from iscat_analysis.instrument.microscope import reach_nm, refuse_uncalibratable
-from iscat_analysis.instrument.particle_image import ParticleImage, place_particle_images, signal_of
+from iscat_analysis.instrument.particle_image import (
+    ParticleImage,
+    place_particle_images,
+    reach_nm,
+    refuse_uncalibratable,
+    signal_of,
+)
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.forward import (
     ForwardModel,
@@ -53,12 +58,8 @@ The farther the template reaches, the more is known of the rings of a particle's
 the larger a picture, the fewer hold one particle alone.
 """
 
-_PLENTY = 18  # pictures with which a margin is good enough
 _HELD_OUT = 3  # every third picture is held out
-_CONTAMINATED_P = 1e-4  # something else happened in a picture with a smaller p-value
 _CONTAMINATED_SHARE = 0.25  # more than this is the template's fault
-_NEW = 0.02  # share of a neighbour's contrast that is new in a picture and disturbs it
-_CLEAR_NM = 600.0  # from the edge of a picture to the nearest other particle
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +152,7 @@ def measure_template(
             larger = config.fit.model_copy(update={"roi_nm": roi_nm + 2 * margin * pixel})
             cut = config.model_copy(update={"fit": larger, "optics": physics, "calibration": None})
             alone = _alone(*bright_particle_images(movie, cut, camera, pool, ready.opening))
-            if len(alone) >= _PLENTY:
+            if len(alone) >= 18:  # pictures with which a margin is good enough
                 break
         progress("particles", len(MARGINS_PX), len(MARGINS_PX))
         if len(alone) < LEAST_IMAGES:
@@ -204,7 +205,8 @@ def _judged(
 
     first = fit([s for i, s in enumerate(images) if i % _HELD_OUT != 1])
     held = fitted_with(images[1::_HELD_OUT], first)
-    kept = [(some, judged(some, first).p_values > _CONTAMINATED_P) for some in (first.images, held)]
+    # something else happened in a picture with a smaller p-value
+    kept = [(some, judged(some, first).p_values > 1e-4) for some in (first.images, held)]
     bad = sum(int(np.sum(~good)) for _, good in kept)
     contaminated = 0
     if 0 < bad <= _CONTAMINATED_SHARE * len(images):
@@ -229,9 +231,11 @@ def _alone(images: Sequence[ParticleImage], others: Sequence[ParticleImage]) -> 
     """Leave out pictures into which another particle reaches."""
 
     def is_alone(image: ParticleImage) -> bool:
-        room = image.grid.pixel_nm * max(image.grid.shape) / 2 + _CLEAR_NM
+        # from the edge of a picture to the nearest other particle
+        room = image.grid.pixel_nm * max(image.grid.shape) / 2 + 600.0
         x, y = float(np.mean(image.grid.x_nm)), float(np.mean(image.grid.y_nm))
-        near = (others[number] for number, share in image.neighbours if abs(share) > _NEW)
+        # share of a neighbour's contrast that is new in a picture and disturbs it
+        near = (others[number] for number, share in image.neighbours if abs(share) > 0.02)
         return all(max(abs(o.x_nm - x), abs(o.y_nm - y)) > room for o in near)
 
     return [image for image in images if is_alone(image)]
@@ -240,12 +244,9 @@ def _alone(images: Sequence[ParticleImage], others: Sequence[ParticleImage]) -> 
 _ROUNDS = 8
 _SETTLED = 0.1  # change of the picture, over its noise, at which rounds end
 _FADE_NM = 250.0  # beyond the pictures the template fades to nothing
-_ROOM_NM = 250.0  # between periodic images, beside what fades
 _ROAM_NM = 400.0  # along x and y, in the fit of one picture
-_RING_NM = 150.0  # width of the rings on which the prior is told
 _LEAST = 1e-4  # of its variance, relative to that of the centre
 _FINE = 8  # points per step of the lattice, where the peak is looked for
-_EVIDENCE = 30  # steps of the variance of the prior
 
 
 @dataclass(frozen=True)
@@ -316,7 +317,8 @@ def fit_picture(
     """Fit the picture that all particles share."""
     pixel = images[0].grid.pixel_nm
     side = max(images[0].grid.shape) * pixel
-    waves = _Waves.within(1.2 / step_nm, side + 2 * (_FADE_NM + _ROOM_NM))
+    # between periodic images, beside what fades
+    waves = _Waves.within(1.2 / step_nm, side + 2 * (_FADE_NM + 250.0))
     own = list(images)
     blur = nominal.area.points(pixel)
     coefficients, scale = np.zeros(2 * waves.qx.size - 1), peak_per_amplitude(nominal)
@@ -405,7 +407,7 @@ def _solve(
     turned = vectors.T @ pull
     ridge = 1e-3 * float(values[-1])
     effective = 0.0
-    for _ in range(_EVIDENCE):
+    for _ in range(30):  # steps of the variance of the prior
         solved = turned / (values + ridge)
         effective = float(np.sum(values / (values + ridge)))
         ridge = effective / float(np.sum(solved**2))
@@ -424,7 +426,8 @@ def _prior(
     basis = waves.on(axis, axis, None)
     noise = np.einsum("pi,ij,pj->p", basis, covariance, basis, optimize=True)
     energy = (basis @ coefficients) ** 2 - noise
-    ring = np.rint(np.hypot(axis[:, None], axis).ravel() / _RING_NM).astype(int)
+    # width of the rings on which the prior is told
+    ring = np.rint(np.hypot(axis[:, None], axis).ravel() / 150.0).astype(int)
     mean = np.bincount(ring, energy) / np.maximum(np.bincount(ring), 1)
     fading = np.maximum.accumulate(np.maximum(mean, _LEAST * mean.max())[::-1])[::-1]
     spread = np.sqrt(fading / fading[0])[ring]

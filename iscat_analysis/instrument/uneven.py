@@ -21,11 +21,17 @@ from scipy.special import chdtrc
 
 from iscat_analysis.config import JUMPS, MOVES, Config
 from iscat_analysis.fitting.ranges import fitted_frames
-from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.joint_fit import Asked, Estimate, asked_changes, maximise
 from iscat_analysis.instrument.measure import HELD_OUT
-from iscat_analysis.instrument.microscope import microscopes, reach_nm, with_heights
-from iscat_analysis.instrument.particle_image import Build, ParticleImage, with_masses
+from iscat_analysis.instrument.particle_image import (
+    Build,
+    Collected,
+    ParticleImage,
+    microscopes,
+    reach_nm,
+    with_heights,
+    with_masses,
+)
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.local import (
     BASES,
@@ -57,14 +63,10 @@ JUMP = "the focus jumps"
 RESTLESS = "the focus moves in a way that is not learned"
 """What is left of a focus that moves, where parts of the movie ask for other ones."""
 
-RANDOM_P = 5e-7
-"""Chance below which pictures ask for a change: five standard errors of a single coefficient."""
 
 LEAST_CHANGE: Mapping[str, float] = {"focus_nm": 7.5, "reference_phase_deg": 4.0}
 """Changes of a parameter below which pictures and masses hardly change."""
 
-LEAST_TERM_NM = 2.0
-"""The same for an aberration."""
 
 LEAST_PICTURES = 6
 """From fewer it is not known how well they tell a change."""
@@ -75,7 +77,6 @@ HELD_OUT_GAIN = 4.0
 _SHARED = ("focus_nm", "reference_phase_deg")  # free beside a change before optics are learned
 _SIDE = 2  # pictures on either side of a jump
 _BLOCKS, _BLOCK = 6, 4  # parts of a movie with a focus of their own, and least pictures of one
-_PERIODS = 20  # parts of the movie with a time of their own, in which pictures are looked at
 _PASSES = 10
 _NEVER: Mapping[str, float] = MappingProxyType({})
 
@@ -108,7 +109,8 @@ class FieldOfView:
     def placed(self, images: Sequence[ParticleImage]) -> list[ParticleImage]:
         """Give pictures their places, and the times of the frames that show their particle."""
         first, last = self.frames
-        part = max((last - first) / _PERIODS, 1.0)
+        # parts of the movie with a time of their own, in which pictures are looked at
+        part = max((last - first) / 20, 1.0)
         x, y, half = self.centre_px
         out = []
         for image in images:
@@ -302,7 +304,8 @@ class _Wishes:
             return None
         changes = np.abs(np.einsum("nmk,m->nk", slopes, size)).max(axis=0)
         largest = zip(self.asked.names, changes.tolist(), strict=True)
-        if all(change < LEAST_CHANGE.get(base, LEAST_TERM_NM) for base, change in largest):
+        # the same for an aberration
+        if all(change < LEAST_CHANGE.get(base, 2.0) for base, change in largest):
             return None
         # the likeliest of many is so by chance, too
         clearness = significance - 2 * math.log(trials)
@@ -310,7 +313,8 @@ class _Wishes:
 
 
 def _by_no_chance(significance: float, parameters: int, trials: int = 1) -> bool:
-    return bool(trials * chdtrc(parameters, significance) < RANDOM_P)
+    # chance below which pictures ask for a change: five standard errors of a single coefficient
+    return bool(trials * chdtrc(parameters, significance) < 5e-7)
 
 
 def rise_nm(terms: Mapping[str, float], frames: tuple[int, int]) -> float:
@@ -334,8 +338,6 @@ def is_plausible(terms: Mapping[str, float], frames: tuple[int, int]) -> bool:
 
 _ENDS = 16  # frames at either end, which show the light before and after
 _LOOKED_AT = 256  # frames between them
-_VOTE = 6.0  # standard errors that each particle counts for at most
-_TIE = 1e-9  # of votes, which rounding makes
 _DARK = 0.5  # of the brightest frame, below which one shows no light
 _CORE_NM = 350.0  # from the middle of a picture: what lands beside it changes little of that
 
@@ -372,7 +374,8 @@ def jump_frame(view: FieldOfView, images: Sequence[ParticleImage], between: tupl
         - np.mean([one[place].ravel() for one in start], axis=0)
         for place in places
     ]
-    found, vote = round((last.shown + first.shown) / 2), _VOTE
+    # standard errors that each particle counts for at most
+    found, vote = round((last.shown + first.shown) / 2), 6.0
     while places:
         frames, light = _lit(
             view.movie, np.unique(np.linspace(low, high - 1, _LOOKED_AT, dtype=int))
@@ -387,7 +390,8 @@ def jump_frame(view: FieldOfView, images: Sequence[ParticleImage], between: tupl
             own[:] = np.sqrt(number * number[::-1] / len(frames)) * np.abs(steps) / noise
         # where all have their vote, those whose steps are clearest
         votes = np.minimum(clear, vote).sum(axis=0)
-        likely = np.where(votes >= votes.max() - _TIE, clear.sum(axis=0), 0.0)
+        # of votes, which rounding makes
+        likely = np.where(votes >= votes.max() - 1e-9, clear.sum(axis=0), 0.0)
         found = int(frames[int(np.argmax(likely)) + 1])
         if high - low <= _LOOKED_AT:
             break

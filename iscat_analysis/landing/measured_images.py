@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import islice, takewhile
 
 import numpy as np
 from scipy import fft
@@ -31,7 +32,7 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.recognition import may_be_large, model_of, recognised
 from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.records import Candidate, FloatArray, Mapper
+from iscat_analysis.records import Candidate, FitResult, FloatArray, Mapper
 from iscat_analysis.search.bright import BrightStep, find_bright_steps
 from iscat_analysis.search.dating import StepFrame
 from iscat_analysis.search.frames import Chunk
@@ -48,30 +49,30 @@ _LEAST_MISFIT_SHARE = 0.1  # share of a misfit that alone passes the threshold w
 _LARGEST_SHIFT_SHARE = 0.35
 
 
-def large_steps(neighbours: Neighbours, mapper: Mapper) -> list[Step]:
-    """Find bright steps that a sphere describes and a dipole does not."""
+def large_steps(neighbours: Neighbours, mapper: Mapper) -> tuple[list[Step], bool]:
+    """Find bright steps that a sphere describes and a dipole does not; tell if trying is in vain.
+
+    With wrong optics dipoles describe no bright step, and spheres neither.
+    """
     context, chunk = neighbours.context, neighbours.chunk
     if not context.spheres_of(context.model):
-        return []
+        return [], False
     optics = context.config.optics
     _, bright = find_bright_steps(
         chunk, neighbours.window, pixel_nm=context.pixel_nm,
         resolution_nm=optics.wavelength_nm / optics.na,
         roi_px=context.roi_px, most=0, mapper=mapper,
     )  # fmt: skip
-    steps: list[Step] = []
-    vain = 0
-    for step in bright:
-        if step.snr < BRIGHT_SNR or vain == IN_VAIN:
-            break
-        vain += 1
+    clear = takewhile(lambda step: step.snr >= BRIGHT_SNR, bright)
+    nominal, z_range = context.model.material.mass_kda, context.config.fit.z_range_nm
+
+    def tried(step: BrightStep) -> list[tuple[int, Likelihood, FitResult]] | None:
+        """Fit spheres that land or leave; None where a dipole suffices."""
         landing = _likelihood_of(context, chunk, step, 1)
-        nominal = context.model.material.mass_kda
         start = Candidate(step.x_px, step.y_px, context.height_nm(nominal), nominal, step.snr)
-        z_range = context.config.fit.z_range_nm
         dipole = fit_particle(landing, start, context.mode, z_range, level=True)
         if not may_be_large(landing, dipole):
-            continue
+            return None
         found = []
         for sign in (1, -1):
             likelihood = landing if sign > 0 else _likelihood_of(context, chunk, step, sign)
@@ -79,12 +80,19 @@ def large_steps(neighbours: Neighbours, mapper: Mapper) -> list[Step]:
             sphere = recognised(likelihood, dipole, spheres, z_range, level=True)
             if sphere is not None:
                 found.append((sign, *sphere))
-        if found:
-            sign, seated, fit = max(found, key=lambda one: one[2].log_likelihood)
-            at = StepFrame.undated(step.frame, neighbours.stride)
-            steps.append(neighbours.draw_sphere(sign, at, model_of(seated), fit))
-            vain = 0
-    return steps
+        return found
+
+    steps: list[Step] = []
+    vain = failed = 0
+    while batch := list(islice(clear, IN_VAIN - vain)):
+        for step, found in zip(batch, mapper(tried, batch), strict=True):
+            vain = 0 if found else vain + 1
+            failed += found is not None
+            if found:
+                sign, seated, fit = max(found, key=lambda one: one[2].log_likelihood)
+                at = StepFrame.undated(step.frame, neighbours.stride)
+                steps.append(neighbours.draw_sphere(sign, at, model_of(seated), fit))
+    return steps, not steps and failed >= IN_VAIN
 
 
 def _likelihood_of(

@@ -84,6 +84,7 @@ class ChunkFitter:
         self.neighbours, self._tasks = neighbours, TaskBuilder(neighbours)
         self._pool, self._excess_noise, self._controlled = pool, excess_noise, controlled
         self.mapper = pool.map
+        self._tries_spheres = True
         self.own = own  # pixels of the chunk that count: those of the core of a tile
         self._context, chunk = neighbours.context, neighbours.chunk
         self._chunk, self._window, self._stride = chunk, neighbours.window, neighbours.stride
@@ -103,7 +104,8 @@ class ChunkFitter:
         maps = StepMaps(self.neighbours, matched)
         steps: list[Step] = []
         if self.neighbours.pattern is None:
-            steps = large_steps(self.neighbours, self.mapper)
+            steps, in_vain = large_steps(self.neighbours, self.mapper)
+            self._tries_spheres = not in_vain
         rejected: list[Step] = []
         for self.rounds in range(1, ROUNDS + 1):
             fresh = [
@@ -368,13 +370,14 @@ class ChunkFitter:
 
         Steps `beside` them are not reported, but their residuals may be found as steps.
         """
-        events = with_spheres(
-            self._context, [own.fitted.event for own in finished], self._pool, level=True
-        )
-        finished = [
-            replace(own, fitted=replace(own.fitted, event=event))
-            for own, event in zip(finished, events, strict=True)
-        ]
+        if self._tries_spheres:
+            events = with_spheres(
+                self._context, [own.fitted.event for own in finished], self._pool, level=True
+            )
+            finished = [
+                replace(own, fitted=replace(own.fitted, event=event))
+                for own, event in zip(finished, events, strict=True)
+            ]
         steps = [*(own.fitted.step for own in finished), *beside]
         settling = {
             sign: go_on_rising([step.at.settling for step in steps if step.sign == sign])

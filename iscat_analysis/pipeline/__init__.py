@@ -30,7 +30,7 @@ from iscat_analysis.diagnosis import (
 )
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.executors import Executor, LocalExecutor
-from iscat_analysis.findings import Finding, existing, remark
+from iscat_analysis.findings import Finding, existing
 from iscat_analysis.fitting.ranges import tracked_frames
 from iscat_analysis.fitting.run import (
     Notify,
@@ -43,8 +43,7 @@ from iscat_analysis.fitting.run import (
     remove_parts,
 )
 from iscat_analysis.inference.checks import number_in, path_in
-from iscat_analysis.instrument.contrast_sign import learn_sign, wrong_sign
-from iscat_analysis.instrument.learning import learn_optics
+from iscat_analysis.instrument.learning import learn_optics, learn_sign, wrong_sign
 from iscat_analysis.movie import Stack, open_stack, path_beside
 from iscat_analysis.pipeline.finish import make_analysis
 from iscat_analysis.pipeline.kinds import kind_of
@@ -196,17 +195,16 @@ def times(state: Prepared) -> tuple[Prepared, list[Finding]]:
 def optics(state: Prepared) -> tuple[Prepared, list[Finding]]:
     """Learn the optics, or the sign of the contrast, from the brightest particles."""
     configured, camera, steady = state.config, state.camera, state.steady
-    texts: list[str] = []
     wrong = wrong_sign(configured)
     if wrong is not None:
-        config, learned = learn_sign(
-            steady, wrong, camera, warn=texts.append, notify=state.notify, opening=state.opening
+        config, learned, findings = learn_sign(
+            steady, wrong, camera, notify=state.notify, opening=state.opening
         )
         config = _with_standards(config, state)
     else:
-        config, learned = learn_optics(
+        config, learned, findings = learn_optics(
             steady, _with_standards(configured, state), camera,
-            warn=texts.append, notify=state.notify, opening=state.opening,
+            notify=state.notify, opening=state.opening,
         )  # fmt: skip
     changes, stretches, breaks = state.changes, state.stretches, None
     if changes is not None and config.optics.na != configured.optics.na:
@@ -218,7 +216,7 @@ def optics(state: Prepared) -> tuple[Prepared, list[Finding]]:
             breaks = stretches.finding(steady.name)
     summary = {**state.summary, **({"optics": learned} if learned else {})}
     state = replace(state, config=config, changes=changes, stretches=stretches, summary=summary)
-    return state, existing([*(remark(text) for text in texts), breaks])
+    return state, existing([*findings, breaks])
 
 
 def kind(state: Prepared) -> tuple[Prepared, list[Finding]]:

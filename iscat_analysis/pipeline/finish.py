@@ -35,13 +35,12 @@ from iscat_analysis.diagnosis import (
     sign_warning,
 )
 from iscat_analysis.executors import versions
-from iscat_analysis.findings import Finding, remark
+from iscat_analysis.findings import Finding
 from iscat_analysis.findings.particles import SPREAD_NOT_MEASURED
 from iscat_analysis.findings.tables import SPHERES_MISSED, TRACKS_LEFT_OUT
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Run
-from iscat_analysis.inference.nuisances import Evidence
 from iscat_analysis.inference.repeats import EmpiricalSpread
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.local import changes_at, terms_of, when
@@ -49,7 +48,6 @@ from iscat_analysis.pipeline.kinds import Kind
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     Analysis,
-    BoolArray,
     Film,
     FloatArray,
     Provenance,
@@ -72,20 +70,18 @@ from iscat_analysis.species.diameters import Sizes, describe_sizes
 from iscat_analysis.species.tables import filter_efficiency, shared_error
 from iscat_analysis.text import printable
 from iscat_analysis.threads import start_in_thread
-from iscat_analysis.trust.budget import SCALE, SPHERES, budget_of, explained_kda, width_warning
-from iscat_analysis.trust.changing_light import at_a_shared_place, in_parts, may_rise, rise_message
-from iscat_analysis.trust.empirical_spread import (
-    measure_spread,
-    measured_scale,
-    repeat_columns,
-    spread_verdict,
+from iscat_analysis.trust.checks import Checked, checked, repeat_columns, spread_verdict
+from iscat_analysis.trust.systematic import (
+    SCALE,
+    SPHERES,
+    budget_of,
+    contributions,
+    explained_kda,
+    misfit_error,
+    total,
+    wide_species,
 )
-from iscat_analysis.trust.extension import Extension
-from iscat_analysis.trust.fluctuation import Fluctuation
-from iscat_analysis.trust.heights import Heights
-from iscat_analysis.trust.pairs import told_as_pairs, with_masses_of_pairs
-from iscat_analysis.trust.systematic import contributions, misfit_error, total
-from iscat_analysis.trust.uneven_reference import reference_warning
+from iscat_analysis.trust.uneven_reference import reference_map
 from iscat_analysis.units import count
 
 _PLACES, _TOGETHER = 48, 6  # where some frames are looked at, and how many
@@ -490,73 +486,32 @@ class ReportedRows:
     """The rows of all events of a movie, and what all events together say."""
 
     table: pd.DataFrame
-    achieved: Mapping[str, EmpiricalSpread]
+    checked: Checked
     budget: list[dict[str, Any]]
-    heights: Heights | None = None
-    extension: Extension | None = None
-    fluctuation: Fluctuation | None = None
-    changing_light: str = ""
 
 
 def reported_rows(
-    found: DetectionResult,
-    *,
-    optics: Mapping[str, Any] = MappingProxyType({}),
-    camera: Mapping[str, Any] | None = None,
+    found: DetectionResult, summary: Mapping[str, Any] = MappingProxyType({})
 ) -> ReportedRows:
-    """Make the rows of all events of a movie, `optics` and `camera` as the summary has them."""
-    fits, config, mode = found.fits, found.context.config, found.context.mode
-    achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}
-    evidence, heights, extension = None, None, None
-    if found.evidence is not None and len(found.evidence):
-        evidence = Evidence(*found.evidence.T)
-        heights = Heights.of(config, fits, evidence)
-        if heights is None or not heights.are_wrong:  # which would look like widths
-            extension = Extension.of(config, fits, evidence, achieved)
-    if extension is not None and config.fit.pairs:
-        paired = told_as_pairs(fits, extension)
-        fits, extension = with_masses_of_pairs(fits, paired), extension.without(paired)
-    shifts = {
-        name: finding.mass_shift_kda
-        for name, finding in (("heights", heights), ("extension", extension))
-        if finding is not None
-    }
-    if extension is not None:
-        fits = flagged(fits, Status.EXTENDED, extension.flagged)
-    changing_light = ""
-    shared_place = np.zeros(len(fits), dtype=bool)
-    resolution_nm = config.optics.wavelength_nm / config.optics.na
-    if config.background.slides:
-        shared_place = at_a_shared_place(fits, resolution_nm)
-        fits = flagged(fits, Status.CHANGING, shared_place)
-        if evidence is not None:
-            parts = in_parts(fits, evidence.rise_frames)
-            fits = flagged(fits, Status.CHANGING, parts)
-            fits, changing_light = _with_changing(fits, evidence, shared_place)
-            shared_place |= parts
-    scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
-    fluctuation = None
-    if not scale:  # which has all that the frames show
-        fluctuation = Fluctuation.of(mode, found.fits, found.repeats, achieved, shared_place)
-    if fluctuation is not None:
-        if config.background.slides and fluctuation.is_seen:
-            wide = at_a_shared_place(fits, resolution_nm, fluctuation.relative)
-            fits = flagged(fits, Status.CHANGING, wide)
-        sigma = np.sqrt(fits["sigma_mass_kda"] ** 2 + fluctuation.variance_kda2)
-        fits = fits.assign(sigma_mass_kda=sigma)
+    """Make the rows of all events of a movie; the summary has sections on optics and camera."""
+    config, mode = found.context.config, found.context.mode
+    seen = checked(found)
+    fits = seen.fits
     columns: dict[str, pd.Series | FloatArray] = {
-        name: fits[name] * factor for name, factor in scale.items()
+        name: fits[name] * factor for name, factor in seen.scale.items()
     }
     unfit, threshold = misfit_error(fits, found.context.roi_px**2), 0.0
     if not MODES[mode].follows_tracks:
         threshold = found.context.templates.threshold
-    elif optics:  # which were tested
+    elif summary.get("optics"):  # which were tested
         from iscat_analysis.tracking.optics import mass_error
 
-        unfit = mass_error(optics)
+        unfit = mass_error(summary["optics"])
     shared = contributions(
-        config, fits, unfit, found.context.model.scale, shifts, camera, threshold, optics
-    )
+        config, fits, summary,
+        mass_share=unfit, scale=found.context.model.scale, held_kda=seen.shifts_kda,
+        threshold_snr=threshold,
+    )  # fmt: skip
     columns |= {f"systematic_{name}": error for name, error in total(shared, len(fits)).items()}
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)
@@ -566,23 +521,12 @@ def reported_rows(
         table[kinds] = table[kinds].where(table["mass_kda"].notna(), np.nan, axis=0)
     if config.fits_sizes:
         table = with_diameters(table, config.particle.density)
-    unknown = SPHERES if config.fits_sizes else SCALE if config.calibration is None else None
-    budget = (
-        budget_of(table, shared, achieved, unknown=unknown, scaled=config.fit.sigma == "measured")
-        if "mass_kda" in FREE_PARAMETERS[mode]
-        else []
-    )
-    return ReportedRows(table, achieved, budget, heights, extension, fluctuation, changing_light)
-
-
-def _with_changing(
-    fits: pd.DataFrame, evidence: Evidence, shared_place: BoolArray
-) -> tuple[pd.DataFrame, str]:
-    """Flag steps whose light may still be changing, and describe that in a message."""
-    unseen, frames = may_rise(fits, evidence, shared_place)
-    rising = int((~shared_place & (np.nan_to_num(evidence.rise_frames) > 0)).sum())
-    text = rise_message(frames, int(unseen.sum()), rising, len(fits))
-    return flagged(fits, Status.CHANGING, unseen), text
+    budget: list[dict[str, Any]] = []
+    if "mass_kda" in FREE_PARAMETERS[mode]:
+        unknown = SPHERES if config.fits_sizes else SCALE if config.calibration is None else None
+        scaled = config.fit.sigma == "measured"
+        budget = budget_of(table, shared, seen.achieved, unknown=unknown, scaled=scaled)
+    return ReportedRows(table, seen, budget)
 
 
 CHECKS: tuple[Callable[[DetectionResult, pd.DataFrame], Finding | None], ...] = (
@@ -625,8 +569,8 @@ def make_analysis(
     if found.optics:
         further["optics"] = found.optics
     further |= extra
-    rows = reported_rows(found, optics=further.get("optics", {}), camera=ready.summary["camera"])
-    table, achieved, budget = rows.table, rows.achieved, rows.budget
+    rows = reported_rows(found, further)
+    table, seen, budget = rows.table, rows.checked, rows.budget
     recorded = ready.whole.metadata.ticks
     ticks = None if recorded is None else np.array(recorded)
     if ticks is not None and table["frame"].notna().all():
@@ -634,34 +578,22 @@ def make_analysis(
     for flag in ready.flags:
         table = flagged(table, flag)
     scale = context.model.scale
-    if rows.changing_light:
-        run.report(remark(rows.changing_light))
-    for name, finding in (
-        ("heights", rows.heights),
-        ("extension", rows.extension),
-        ("fluctuation", rows.fluctuation),
-    ):
-        if finding is not None:
-            further[name] = finding.summary
-            if finding.message:
-                run.report(remark(finding.message))
-    if reference := reference_warning(config, table):
-        run.report(remark(reference))
+    further |= seen.sections
+    uneven = reference_map(config, table)
+    run.report(*seen.findings, uneven and uneven.finding)
     run.report(*(check(found, table) for check in CHECKS))
     scaled = config.fit.sigma == "measured"
     if found.repeats:
-        seen = rows.fluctuation is not None and rows.fluctuation.is_seen
-        had = ("mass_kda",) if seen else ()  # by σ
-        verdict = spread_verdict(
-            {name: one for name, one in achieved.items() if name not in had},
+        fluctuates = seen.fluctuation is not None and seen.fluctuation.is_seen
+        had = ("mass_kda",) if fluctuates else ()  # by σ
+        further["repeats"], understated = spread_verdict(
+            {name: one for name, one in seen.achieved.items() if name not in had},
             found.summary,
             scaled=scaled,
             rejected=is_rejected(table),
             sliding=config.background.slides,
         )
-        further["repeats"] = verdict
-        if verdict["message"]:
-            run.report(remark(verdict["message"]))
+        run.report(understated)
     elif scaled and len(table):
         run.report(SPREAD_NOT_MEASURED())
     tracks: pd.DataFrame | None = None
@@ -690,11 +622,9 @@ def make_analysis(
     explained = {"explained_kda": explained_kda(budget)}
     described["across_particles"] = [one | explained for one in described["across_particles"]]
     calibrated = config.calibration is not None or config.fits_sizes
-    wide = width_warning(described["across_particles"], calibrated=calibrated)
-    if wide:
-        run.report(remark(wide))
+    run.report(wide_species(described["across_particles"], calibrated=calibrated))
     timeline = timeline_future.result()
-    summary = summary_of(context, table, compared, run.clock.seconds, achieved)
+    summary = summary_of(context, table, compared, run.clock.seconds, seen.achieved)
     provenance = Provenance(
         command=printable(command) or "iscat_analysis.pipeline.analyse",
         input_path=printable(str(ready.whole.path)),

@@ -23,10 +23,9 @@ from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.inference.cause import PIXEL, Cause, likely_cause
 from iscat_analysis.inference.fit import goodness_of_fit
-from iscat_analysis.instrument.fit_optics import Collected
-from iscat_analysis.instrument.learning import adopted
+from iscat_analysis.instrument.learning import REJECTED_P, adopted
 from iscat_analysis.instrument.loop import Rounds, learn
-from iscat_analysis.instrument.microscope import REJECTED_P
+from iscat_analysis.instrument.particle_image import Collected
 from iscat_analysis.optics.parameters import FREE, MOST_IMAGES, Settings, heights_free, settings_of
 from iscat_analysis.records import BoolArray
 from iscat_analysis.tracking.blocks import Aligned, Block
@@ -147,9 +146,10 @@ def learn_from_tracks(
             rounds = learn(tracks, config, tuple(FREE), {"movie": name}, pool.map)
             if rounds.best is not None:
                 found = rounds.best.found.less_sure(rounds.error_of(rounds.best))
-                learned, told = adopted(
-                    found, config, tested, left.verdict, picture_of="track picture", warn=run.warn
+                learned, told, findings = adopted(
+                    found, config, tested, left.verdict, picture_of="track picture"
                 )
+                run.report(*findings)
                 return begin(learned), told
             why = next((one.reason for one in reversed(rounds.all) if one.reason), _NO_BETTER)
             last = tracks.begun

@@ -33,6 +33,10 @@ import scipy
 from scipy.special import chdtrc, chdtri, ndtri
 
 from iscat_analysis.config import Config
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.optics import LONG_IMAGES, UNEQUAL_HEIGHTS, WIDE_IMAGES
+from iscat_analysis.inference.fit import POOR_FIT_P
+from iscat_analysis.inference.heights import HeightSpread, has_prior, spread_of_heights
 from iscat_analysis.inference.nuisances import Evidence
 from iscat_analysis.inference.repeats import EmpiricalSpread
 from iscat_analysis.optics.forward import forward_model
@@ -49,7 +53,6 @@ _LEAST_SHIFT_SIGMAS = 0.5
 _OUTLIER_SIGMAS = 4.0  # standard errors beyond which an event is not one of many
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value})
 _HIDDEN = 0.5  # probability that length, or time, shows nothing of a spread
-_WIDER_PRIOR = 2.0  # standard deviation of the prior over a √v that is clear
 _LEAST_LEFT = 1e-3  # share of a width that learned optics do not imitate; less is rounding
 _STEPS, _REACH_SIGMAS = 1000, 6.0  # of the √v over which the posterior is summed
 
@@ -122,7 +125,8 @@ class Extension:
         is_common = bool(clear and many.sum() >= FEWEST)
         prior_sd = config.uncertainty.wiggle_nm
         if is_common:  # a narrow prior would pull a clear width towards zero
-            prior_sd = max(prior_sd, _WIDER_PRIOR * math.sqrt(max(clear)))
+            # standard deviation of the prior over a √v that is clear
+            prior_sd = max(prior_sd, 2.0 * math.sqrt(max(clear)))
         middle, sd = _posterior(
             (mean, error), prior_sd, length.log_likelihood, _normal(moved, moved_se)
         )
@@ -155,30 +159,14 @@ class Extension:
         )
 
     @property
-    def message(self) -> str:
-        """Message for the user; empty where images are as wide as the model's."""
+    def finding(self) -> Finding | None:
+        """That images are wider than the model's; None where they are not."""
         if not self.is_common:
-            return ""
+            return None
+        kind = LONG_IMAGES if self.is_long else WIDE_IMAGES
         wide = math.sqrt(self.mean_nm2)
-        error = self.sd_nm2 / (2 * wide)
-        if self.is_long:
-            causes = " and elongated, each in its own direction: particles have separate parts"
-            remedy = "fit.pairs = true gives the mass of two halves to rows with enough light"
-        else:
-            causes = (
-                ": particles wiggle or have separate parts, or wavelength, NA, focus or pixel size "
-                "are not those configured, or the illumination is a cone, or pixels were averaged"
-            )
-            remedy = (
-                "check the optics first; then set particle.wiggle_nm to it (adding squares) if all "
-                "particles wiggle alike, or fit.pairs = true if they may be two halves"
-            )
-        two = f"; {self.paired} rows have the mass of two halves" if self.paired else ""
-        return (
-            f"images are wider than a point's by a variance of ({wide:.1f} ± {error:.1f} nm)² "
-            f"along each axis{causes}; masses are too small, and rows are flagged extended where "
-            f"by more than half of σ; {remedy}{two}"
-        )
+        paired = f"; {self.paired} rows have the mass of two halves" if self.paired else ""
+        return kind({"width_nm": wide, "error_nm": self.sd_nm2 / (2 * wide), "paired": paired})
 
     @property
     def summary(self) -> Mapping[str, Any]:
@@ -334,3 +322,94 @@ def _wiggle(
         found.append((2 * excess * one, 2 * error * one))
     (x, x_se), (y, y_se) = found
     return (x + y) / 2 - known_nm**2, math.hypot(x_se, y_se) / 2
+
+
+_DESCRIBED = frozenset({Status.OK.value, Status.POOR_FIT.value})
+"""Verdicts with which a height can still be read; a height that is held makes fits poor itself."""
+
+
+@dataclass(frozen=True)
+class Heights:
+    """Heights that the light of all events shows, and the mass shifts that follow."""
+
+    spread: HeightSpread
+    held: bool
+    mass_shift_kda: FloatArray  # of every row, where heights are held and are not equal
+    learned_optics: bool
+
+    @classmethod
+    def of(cls, config: Config, table: pd.DataFrame, evidence: Evidence) -> Heights | None:
+        """Estimate the heights from all rows; None where there are too few."""
+        held = not has_prior(config)
+        kinds = _DESCRIBED if held else frozenset({Status.OK.value})
+        good = has_only(table, kinds)
+        spread = spread_of_heights(evidence.z_nm[good], evidence.sigma_z_nm[good])
+        if spread is None:
+            return None
+        shift = np.zeros(len(table))
+        if held and spread.is_spread:
+            off = math.hypot(spread.sd_nm, spread.mean_nm - config.particle.nominal_height_nm)
+            shift = np.abs(np.nan_to_num(evidence.mass_per_z)) * off
+        return cls(spread, held, shift, config.optics.are_learned)
+
+    @property
+    def are_wrong(self) -> bool:
+        """Whether one height is held although the particles have different heights."""
+        return self.held and self.spread.is_spread
+
+    @property
+    def finding(self) -> Finding | None:
+        """That heights differ where one is held; None where heights and errors agree."""
+        return UNEQUAL_HEIGHTS({"spread": str(self.spread)}) if self.are_wrong else None
+
+    @property
+    def summary(self) -> Mapping[str, Any]:
+        """What ``summary.json`` says."""
+        spread = self.spread
+        return {
+            "mean_nm": spread.mean_nm,
+            "mean_se_nm": spread.mean_se_nm,
+            "sd_nm": spread.sd_nm,
+            "sd_ci95_nm": [spread.sd_low_nm, spread.sd_high_nm],
+            "events": spread.events,
+            "held": self.held,
+            "mean_is_of_learned_optics": self.learned_optics,
+        }
+
+
+_REPLACED = {
+    "mass_kda": "pair_mass_kda",
+    "sigma_mass_kda": "sigma_pair_mass_kda",
+    "crb_mass_kda": "sigma_pair_mass_kda",
+    "chi2_reduced": "pair_chi2_reduced",
+    "p_value": "pair_p_value",
+}
+
+
+def told_as_pairs(table: pd.DataFrame, extension: Extension) -> BoolArray:
+    """Select the extended rows that get the mass of two halves.
+
+    Two halves make elongated images, each in its own direction; wiggling makes images only wider. A
+    row counts as two halves if its own image is clearly elongated, or if the images of the movie
+    are and the error of the distance in this row is small beside the distance of the movie.  The
+    distance that the row itself shows is no criterion: it would select rows that noise has made
+    longer.
+    """
+    square_sigma = 2 * table["separation_nm"] * table["sigma_separation_nm"]
+    of_movie = 8 * extension.mean_nm2 if extension.is_long else 0.0  # v is d²/8
+    # of the square of the distance, beyond which its error is nearly normal
+    two = (of_movie > 2.0 * square_sigma) | extension.long
+    return np.asarray(two & table["pair_mass_kda"].notna() & extension.flagged)
+
+
+def with_masses_of_pairs(table: pd.DataFrame, which: BoolArray) -> pd.DataFrame:
+    """Replace masses, errors and goodness of fit; a fit that is good no longer is `poor_fit`."""
+    out = table.copy()
+    for name, by in _REPLACED.items():
+        out.loc[which, name] = table.loc[which, by]
+    for row in out.index[which & (table["pair_p_value"] >= POOR_FIT_P).to_numpy()]:
+        known = str(out.at[row, "flags"] or "").split(";")
+        flags = [flag for flag in known if flag not in ("", Status.POOR_FIT)]
+        out.at[row, "flags"] = ";".join(flags)
+        out.at[row, "status"] = flags[0] if flags else Status.OK.value
+    return out

@@ -28,13 +28,9 @@ from iscat_analysis.records import (
 )
 from iscat_analysis.search.empty import CONTRASTS, EmptyField, EmptySpread
 
-MOST_DISTANCES = 6
-"""Distances between a frame and its background at which the noise is told apart."""
-
 # Of the square's side; a poor fit leaves its rings over
 _NEAR_SHARE, _NEAR_SHARE_POOR = 1 / 3, 1 / 2
 _LARGEST_SIGNAL_SHARE = 0.1
-_EXACTLY = 1e-12  # variance of a background that is given, over that of one frame
 _WHOLE = CONTRASTS.index("whole")
 
 
@@ -142,12 +138,14 @@ class FrameNoise:
         self._level = windows.before_e / light
         self._before = self._field.errors(windows.before_e, light, None)
         # A background noisier than the mean of its frames is worth less light than they hold.
-        self._worth = light / max(context.background_variance, _EXACTLY)
+        # variance of a background that is given, over that of one frame
+        self._worth = light / max(context.background_variance, 1e-12)
         first, last = windows.frames_after
         known = windows.n_before == 0
         self._middle = first - 1.0 if known else (sum(windows.frames_before) - 1) / 2
         near, far = sorted((abs(first - self._middle), abs(last - 1 - self._middle)))
-        self._edges = np.geomspace(near, far, min(MOST_DISTANCES, last - first) + 1)[1:-1]
+        # distances between a frame and its background at which the noise is told apart
+        self._edges = np.geomspace(near, far, min(6, last - first) + 1)[1:-1]
         bins = self._edges.size + 1
         free = len(FREE_PARAMETERS[context.mode])
         self._squares = np.zeros((2 + bins, free, self._field.tiles))

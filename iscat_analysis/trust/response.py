@@ -26,7 +26,6 @@ COMMON = (*PARAMETERS, "contrast")
 """What such errors are told of; of the contrast where it is the result, without a calibration."""
 
 _AMPLITUDES = 4  # at which the response to the optics is computed, for the span of all events
-_HEIGHTS_PER_FRINGE = 10  # between them it is interpolated
 _FAINT = 1e-6  # peak contrast of a particle whose scattered light alone is nothing
 _XX, _YY = 5, 7  # rows of second derivatives
 _KNOWN = 1e-12  # of the prior's variance, below which an error is none
@@ -306,7 +305,7 @@ def height_weights(
     if not np.ptp(z_nm):
         return z_nm[:1], np.ones((z_nm.size, 1))
     low, high = span
-    count = max(int(np.ceil((high - low) * _HEIGHTS_PER_FRINGE / fringe_nm)), 3)
+    count = max(int(np.ceil((high - low) * 10 / fringe_nm)), 3)  # between them it is interpolated
     place = (np.clip(z_nm, low, high) - low) / (high - low) * count
     first = np.clip(np.floor(place).astype(int) - 1, 0, count - 3)
     weights = np.zeros((z_nm.size, count + 1))

@@ -21,15 +21,27 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
+from iscat_analysis.bounds import peak_gradient
 from iscat_analysis.calibration import line_sigma_kda
 from iscat_analysis.config import Config, OpticsCovariance
-from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.optics import WIDE_SPECIES
+from iscat_analysis.inference.repeats import EmpiricalSpread
+from iscat_analysis.optics.forward import (
+    PEAK_SEARCH_RADIUS,
+    ForwardModel,
+    MassScale,
+    PixelGrid,
+    forward_model,
+    signed_peak,
+)
 from iscat_analysis.optics.local import BASES, REFERENCE, WEIGHTS, centre_of, when
 from iscat_analysis.optics.measured import Template
+from iscat_analysis.optics.scatterers import material
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
-from iscat_analysis.trust.assumed import INPUTS, assumed_error
 from iscat_analysis.trust.response import (
     COMMON,
+    Response,
     amplitude_nodes,
     at_standards,
     has_own_index,
@@ -48,15 +60,8 @@ MASS_SHARE = 0.4
 """Error of masses over what optics that are wrong leave over of the pictures: root mean square of
 eleven such microscopes, 0 to 0.97."""
 
-_FEWEST_PICTURES = 8  # that tell what is left over of them
 _SPREAD = 2.0  # ratio of squared SNR, over which noise and misfit can be told apart
-_MISFIT_SIGMAS = 5.0  # by which something is left over
-_MEDIAN_SE = 1.2533  # standard error of a median over that of a mean
-# Of a mass; beneath, lines of standards that scatter by a per cent are as wrong
-_LEAST_NONLINEAR_SHARE = 0.02
-_NONLINEAR_SIGMAS = 5.0  # beyond which the square is clear in a single row, however small its share
 _LEAST_SIGMAS = 0.5  # of σ, beyond which it is in the budget
-_LEAST_SELECTED = 0.01  # of σ, below which a threshold does nothing
 _SAME = 1e-6  # change of the scale, which rounding leaves between equal optics
 # What rounding leaves of a place, mass or contrast that the optics do not change [nm, kDa, and 1]
 _NOTHING = {"x_nm": 1e-4, "y_nm": 1e-4, "z_nm": 1e-4, "mass_kda": 1e-9, "contrast": 1e-9}
@@ -123,20 +128,21 @@ Contribution = tuple[Source, Mapping[str, FloatArray]]
 def contributions(
     config: Config,
     table: pd.DataFrame,
+    summary: Mapping[str, Any] = MappingProxyType({}),
+    *,
     mass_share: float = 0.0,
     scale: MassScale | None = None,
     held_kda: Mapping[str, FloatArray] = MappingProxyType({}),
-    camera: Mapping[str, Any] | None = None,
     threshold_snr: float = 0.0,
-    optics: Mapping[str, Any] = MappingProxyType({}),
 ) -> list[Contribution]:
     """Give what each source makes of the events of a movie, where it makes anything of them.
 
-    `camera` and `optics` are sections of ``summary.json``, `threshold_snr` is that of the search.
+    The summary has sections on camera and optics; `threshold_snr` is that of the search.
 
     Shapes: `held_kda` (rows,) each: what heights or extensions that were held do to the masses.
     """
-    sources = [*sources_of(config, mass_share, scale), *_of_the_camera(config, camera or {})]
+    camera, optics = (summary.get(name) or {} for name in ("camera", "optics"))
+    sources = [*sources_of(config, mass_share, scale), *_of_the_camera(config, camera)]
     if threshold_snr:
         sources.append(
             Source("selection near the threshold", "measured",
@@ -245,7 +251,7 @@ def _of_the_selection(
     sigma, snr = (table[name].to_numpy(float) for name in ("sigma_mass_kda", "snr"))
     over = np.maximum(snr - threshold_snr, 0.0)
     shift = np.exp(-0.5 * over**2 - log_ndtr(over)) / math.sqrt(2 * math.pi)
-    shift = np.where(shift > _LEAST_SELECTED, shift, 0.0)
+    shift = np.where(shift > 0.01, shift, 0.0)  # of σ, below which a threshold does nothing
     return {"mass_kda": shift * sigma} if np.any(shift > 0) else {}
 
 
@@ -272,18 +278,18 @@ def misfit_error(table: pd.DataFrame, pixels: int) -> float:
     """
     judged = table["status"].isin([Status.OK.value, Status.POOR_FIT.value])
     rows = table[judged & np.isfinite(table["chi2_reduced"]) & np.isfinite(table["snr"])]
-    if len(rows) < _FEWEST_PICTURES:
+    if len(rows) < 8:  # that tell what is left over of them
         return 0.0
     rows = rows.sort_values("snr")
     power, excess = (rows["snr"] ** 2 / pixels).to_numpy(), rows["chi2_reduced"].to_numpy() - 1
     half = len(rows) // 2
     rise, over = float(np.median(power[half:])), float(np.median(excess[half:]))
-    error = _MEDIAN_SE * math.sqrt(2 / pixels / half)
+    error = 1.2533 * math.sqrt(2 / pixels / half)  # standard error of a median over that of a mean
     faint = float(np.median(power[:half]))
     if rise > _SPREAD * faint:
         rise, over = rise - faint, over - float(np.median(excess[:half]))
         error *= math.sqrt(2)
-    if over < _MISFIT_SIGMAS * error:
+    if over < 5.0 * error:  # by which something is left over
         return 0.0
     share = math.sqrt(over / rise)
     return MASS_SHARE * share if share > REJECTED_SHARE else 0.0
@@ -318,8 +324,10 @@ def is_bent(scale: MassScale, table: pd.DataFrame) -> NDArray[np.bool_]:
     off, sigma = _off_the_line(scale, table)
     share = off / np.maximum(np.abs(table["mass_kda"].to_numpy(float)), 1e-300)
     return np.asarray(
-        (off > _NONLINEAR_SIGMAS * sigma)
-        | ((share > _LEAST_NONLINEAR_SHARE) & (off > _LEAST_SIGMAS * sigma)),
+        # beyond which the square is clear in a single row, however small its share
+        (off > 5.0 * sigma)
+        # of a mass; beneath, lines of standards that scatter by a per cent are as wrong
+        | ((share > 0.02) & (off > _LEAST_SIGMAS * sigma)),
         dtype=np.bool_,
     )
 
@@ -477,3 +485,322 @@ def _of_the_template(config: Config, table: pd.DataFrame) -> Mapping[str, FloatA
     contrast = table["contrast"].to_numpy(dtype=float)
     relative = Template.read(Path(optics.template)).peak_se
     return {"mass_kda": np.abs(mass) * relative, "contrast": np.abs(contrast) * relative}
+
+
+_STEP = 0.1  # of a standard deviation, for derivatives
+
+
+@dataclass(frozen=True)
+class Input:
+    """An input of the model, by its key in [uncertainty]."""
+
+    key: str
+    label: str
+    remedy: str
+
+
+INPUTS = (
+    Input("wavelength_nm", "wavelength", "measure the spectrum of the light"),
+    Input("n_sample", "refractive index of the sample", "measure the index of the buffer"),
+    Input("n_glass", "refractive index of the glass", "take the maker's value at this wavelength"),
+    Input("index", "refractive index of the spheres", "spheres that move, or of known diameter"),
+    Input("height_nm", "mean height of the particles", "standards that bind at the same height"),
+    Input("magnification", "magnification", "measure the pixel size with a graticule"),
+)
+"""In the order of the budget.  Standards of the same set-up take all of them away."""
+
+
+def assumed_error(key: str, config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
+    """Error of the masses of a movie that the uncertainty of one input makes.
+
+    If an input is off by δ, the pictures are those of the input plus δ, and the fit imitates the
+    change with the amplitude of the particle: a relative shift D·δ.  What becomes of the mass
+    depends on where its scale is from:
+
+    * standards that were recorded, with the same value of the input: their amplitudes shifted too,
+    and D_here − D_there remains, which is nothing where all is equal; * standards that were
+    recorded with another value: both shifts, independent of each other; * a gradient from
+    elsewhere: if it is of a set-up where the input was right, D; if it is the true contrast per kDa
+    of this one, which the model turns amplitudes into with the wrong input, D − ∂ ln L/∂input, L
+    the model's contrast per amplitude.  Nobody knows which: the larger counts.
+
+    The mass of a sphere follows from its picture without standards, and what remains of it is D.
+
+    Where optics were learned from pictures, with the wrong input, they are wrong as well: their
+    shift is part of D, and of L where the gradient is taken at learned optics.
+    """
+    sigma = float(getattr(config.uncertainty, key))
+    line, optics = config.calibration, config.optics
+    if config.fits_sizes and sigma and not table.empty:
+        return _of_spheres(key, config, table, sigma)
+    suited = optics.scheme != "darkfield" and optics.convention == "exact"
+    suited = suited and optics.psf == "model" and config.camera.pixel_size_nm is not None
+    fitted = "mass_kda" in FREE_PARAMETERS[config.fit.mode]
+    if not sigma or key == "index" or line is None or not (suited and fitted) or table.empty:
+        return {}
+    there = at_standards(config)
+    recorded = line.optics is not None and not line.optics_assumed
+    if recorded and _alike(config, there):
+        return {}
+    mass = table["mass_kda"].to_numpy(float)
+    good = mass[(table["status"] == Status.OK.value).to_numpy()]
+    typical = float(np.median(np.abs(good))) if good.size else None
+    here = _shift(key, config, table, sigma, typical)
+    if not recorded:
+        share = max(abs(here), abs(here - _peak_shift(key, there, table, sigma)))
+    elif _value(key, config) == _value(key, there):
+        share = abs(here - _shift(key, there, table, sigma))
+    else:
+        share = math.hypot(here, _shift(key, there, table, sigma))
+    return {"mass_kda": share * np.abs(mass)}
+
+
+def _of_spheres(
+    key: str, config: Config, table: pd.DataFrame, sigma: float
+) -> Mapping[str, FloatArray]:
+    """Error of the masses of spheres, which follow from their pictures without standards.
+
+    An index that was fitted is not assumed, and takes its part of what other inputs have wrong.
+    """
+    mass = np.abs(table["mass_kda"].to_numpy(float))
+    if config.optics.scheme == "darkfield" or not np.isfinite(mass).any():
+        return {}
+    own = has_own_index(table)
+    share = np.zeros(mass.size)
+    for index in (False, True):
+        rows = (own == index) & np.isfinite(mass)
+        if rows.any() and not (index and key == "index"):
+            typical = float(np.median(mass[rows]))
+            share[rows] = abs(_shift(key, config, table, sigma, typical, index=index))
+    return {"mass_kda": share * mass}
+
+
+def _alike(here: Config, there: Config) -> bool:
+    """Tell whether standards were measured like the particles, so that all shifts are equal."""
+    return (
+        here.optics.model_copy(update={"file": None, "calibrate": "auto"})
+        == there.optics.model_copy(update={"file": None, "calibrate": "auto"})
+        and here.particle.nominal_height_nm == there.particle.nominal_height_nm
+        and here.camera.pixel_size_nm == there.camera.pixel_size_nm
+        and here.fit.mode == "mass"
+    )
+
+
+def _value(key: str, config: Config) -> float | None:
+    values = {
+        "height_nm": config.particle.nominal_height_nm,
+        "magnification": config.camera.pixel_size_nm,
+    }
+    return values[key] if key in values else float(getattr(config.optics, key))
+
+
+def _shift(
+    key: str,
+    config: Config,
+    table: pd.DataFrame,
+    sigma: float,
+    mass_kda: float | None = None,
+    *,
+    index: bool = False,
+) -> float:
+    """Relative shift of the amplitude for one standard deviation of an input.
+
+    Of a particle of a mass; without one, of a faint particle, as standards are.  The `index` of a
+    sphere may be free.
+    """
+    respond = response_of(config, table)
+    amplitude = respond.faint_amplitude
+    if mass_kda is not None:
+        scale = forward_model(config, respond.model.reach_nm).scale
+        amplitude = float(scale.amplitudes(mass_kda))
+    change = _change(key, config, respond, amplitude, sigma)
+    return respond.to_input(change, amplitude, index=index).amplitude
+
+
+def _change(
+    key: str, config: Config, respond: Response, amplitude: float, sigma: float
+) -> FloatArray:
+    """Change of the picture for one standard deviation of an input, (ny, nx)."""
+    x, y, z, *_ = respond.theta(respond.model.height_nm, amplitude)
+    grid = respond.grid
+
+    def picture(sign: float) -> FloatArray:
+        step = sign * _STEP * sigma
+        if key == "height_nm":
+            return respond.model.amplitude_image(grid, x, y, z + step, amplitude)
+        if key == "magnification":
+            larger = PixelGrid(
+                grid.x_nm * (1 + step), grid.y_nm * (1 + step), grid.pixel_nm * (1 + step)
+            )
+            return respond.model.amplitude_image(larger, x, y, z, amplitude)
+        model = forward_model(_moved(key, config, step), respond.model.reach_nm)
+        return model.amplitude_image(grid, x, y, z, amplitude)
+
+    return (picture(1.0) - picture(-1.0)) / (2 * _STEP)
+
+
+def _peak_shift(key: str, config: Config, table: pd.DataFrame, sigma: float) -> float:
+    """Relative error of the model's contrast per amplitude for one standard deviation."""
+
+    def peak(sign: float) -> float:
+        moved = _moved(key, config, sign * _STEP * sigma)
+        reach_nm = PEAK_SEARCH_RADIUS * moved.optics.wavelength_nm / moved.optics.na
+        return signed_peak(forward_model(moved, reach_nm))
+
+    shift = 0.0
+    if key != "magnification":
+        shift = (peak(1.0) - peak(-1.0)) / (2 * _STEP) / peak(0.0)
+    respond = response_of(config, table)
+    if respond.names:
+        faint = respond.faint_amplitude
+        change = _change(key, config, respond, faint, sigma)
+        optics = respond.to_input(change, faint).optics
+        height = respond.model.height_nm
+        contrast, _, slopes = peak_gradient(respond.model, height, faint, respond.names)
+        shift -= float(slopes @ optics) / contrast
+    return shift
+
+
+def _moved(key: str, config: Config, step: float) -> Config:
+    """Move an input, and leave the stage where it is."""
+    update: dict[str, Any] = {"calibration": None}
+    if key == "index":
+        index = np.sqrt(material(config.particle, config.optics.wavelength_nm).permittivity) + step
+        permittivity = float((index**2).real), float((index**2).imag)
+        particle = config.particle.model_copy(update={"permittivity": permittivity, "index": None})
+        update |= {"particle": particle}
+    elif key == "height_nm":
+        height, optics = config.particle.nominal_height_nm + step, config.optics
+        # the oil, which the nominal height and the focus set together, stays
+        focus = optics.focus_nm + step * (1 - optics.n_immersion / optics.n_sample)
+        update |= {
+            "particle": config.particle.held_at(height),
+            "optics": optics.model_copy(update={"focus_nm": focus}),
+        }
+    else:
+        value = float(getattr(config.optics, key)) + step
+        update |= {"optics": config.optics.model_copy(update={key: value})}
+    return config.model_copy(update=update)
+
+
+SCALE = "scale of the model", "measure standards (iscat calibrate mass)"
+"""What nobody knows of masses without standards, and what tells it."""
+
+SPHERES = "density of the spheres", "weigh some: a diameter does not need it"
+"""The same of spheres, whose masses follow from their pictures with these."""
+
+_LEAST_WIDTH = 0.25  # of σ: a width beneath it is not worth a line
+_CLEAR_SIGMAS = 3.0  # standard errors by which noise is more than σ says
+
+
+def budget_of(
+    table: pd.DataFrame,
+    found: Sequence[Contribution],
+    achieved: Mapping[str, EmpiricalSpread],
+    *,
+    unknown: tuple[str, str] | None,
+    scaled: bool,
+) -> list[dict[str, Any]]:
+    """List what the error of a mass is made of: medians over the rows that are ok.
+
+    Sources that are common to all rows add up to ``systematic_mass_kda``.  What is `unknown` has a
+    name and a remedy, and no size.
+    """
+    good = table["status"] == Status.OK.value
+    rows = table[good] if good.any() else table
+    mass = rows["mass_kda"].abs().to_numpy(float)
+    if not np.isfinite(rows["sigma_mass_kda"].to_numpy(float)).any():
+        return []
+    noise = rows["sigma_mass_kda"].to_numpy(float)
+    remedy = "more light, or more frames of each particle"
+    budget = [
+        _entry("photon noise", "measured", noise, mass, remedy, common=False),
+        _entry(  # 1/SNR² of the mass is taken off, at an SNR that is off by 1
+            "bias of faint particles, taken off", "measured", noise**3 / mass**2, mass, remedy,
+            common=False,
+        ),
+    ]  # fmt: skip
+    spread = achieved.get("mass_kda")
+    if (
+        spread is not None
+        and not scaled
+        and spread.significance > _CLEAR_SIGMAS
+        and spread.over_crb > 1
+    ):
+        excess = noise * math.sqrt(spread.over_crb**2 - 1)
+        remedy = 'steadier light or stage; fit.sigma = "measured" puts it into sigma'
+        budget.append(
+            _entry("noise beyond photons", "measured", excess, mass, remedy, common=False)
+        )
+    common = [
+        _entry(
+            source.name, source.kind, errors["mass_kda"][rows.index.to_numpy()], mass,
+            source.remedy, dof=source.dof,
+        )
+        for source, errors in found
+        if "mass_kda" in errors
+    ]  # fmt: skip
+    if unknown is not None:
+        name, remedy = unknown
+        common.append(
+            {
+                "name": name, "kind": "assumed", "common": True,
+                "sigma_mass_kda": None, "sigma_rel": None, "dof": None,
+                "remedy": remedy,
+            }
+        )  # fmt: skip
+    return budget + sorted(common, key=lambda one: -(one["sigma_mass_kda"] or math.inf))
+
+
+def _entry(
+    name: str,
+    kind: str,
+    sigma: FloatArray,
+    mass: FloatArray,
+    remedy: str,
+    *,
+    common: bool = True,
+    dof: float | None = None,
+) -> dict[str, Any]:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        relative = np.abs(sigma) / mass
+    return {
+        "name": name,
+        "kind": kind,
+        "common": common,
+        "sigma_mass_kda": _median(np.abs(sigma)),
+        "sigma_rel": _median(relative),
+        "dof": dof,
+        "remedy": remedy,
+    }
+
+
+def _median(values: FloatArray) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else None
+
+
+def explained_kda(budget: Sequence[Mapping[str, Any]]) -> float:
+    """Width of a species that the budget explains beyond σ: errors that differ between rows."""
+    own = [one for one in budget if not one["common"] and one["name"] != "photon noise"]
+    return math.sqrt(sum((one["sigma_mass_kda"] or 0.0) ** 2 for one in own))
+
+
+def wide_species(across: Sequence[Mapping[str, Any]], *, calibrated: bool) -> Finding | None:
+    """Say which species is widest beyond what the budget explains; None where it explains all."""
+    wide = []
+    for one in across:
+        low, width = one["width_low"], one["width_kda"]
+        if low is None or width is None or not math.isfinite(low) or not one["mass_kda"]:
+            continue  # nothing is a share of no mass
+        sigma = width / math.sqrt(max(one["spread_over_sigma"] ** 2 - 1, 1e-12))
+        if low > max(one["explained_kda"], _LEAST_WIDTH * sigma):
+            wide.append(one)
+    if not wide:
+        return None
+    one = max(wide, key=lambda each: each["width_kda"] / each["mass_kda"])
+    names = {"percent": "width_kda", "least_percent": "width_low"}
+    names |= {"explained_percent": "explained_kda"}
+    shares = {name: 100 * one[key] / one["mass_kda"] for name, key in names.items()}
+    where = f"at {one['mass_kda']:.4g} kDa" if calibrated else "of contrast"
+    return WIDE_SPECIES(shares | {"where": where})

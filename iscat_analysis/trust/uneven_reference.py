@@ -17,12 +17,12 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.config import Config
+from iscat_analysis.findings import Finding
+from iscat_analysis.findings.optics import UNEVEN_REFERENCE
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
 
 TERMS = ("reference_tilt_x", "reference_tilt_y", "reference_curvature")
 
-LEAST_MASSES = 20
-"""Masses without which nothing is asked for."""
 
 MOST_MASSES = 150
 """Masses that are compared, those of the smallest relative error."""
@@ -30,11 +30,6 @@ MOST_MASSES = 150
 GAIN = 14.0
 """Log-likelihood that the coefficients must gain."""
 
-EXCHANGES = 19
-"""Exchanges of places, with each of which the masses must agree clearly less."""
-
-CLEARLY = 8.0
-"""Log-likelihood by which that is so."""
 
 _LARGEST = 0.3  # of a coefficient
 _WIDTHS = (0.5, 30.0)  # of a kernel, over the error of a mass
@@ -56,25 +51,16 @@ class ReferenceMap(NamedTuple):
         return np.asarray(_places(x_px, y_px, self.field_px) @ self.terms)
 
     @property
-    def warning(self) -> str:
-        """Say so, and what to set."""
-        x, y, curved = (f"{value:+.4f}" for value in self.terms)
+    def finding(self) -> Finding:
+        """That it is so, and what to set."""
+        ways = ("along x", "along y", "with the square of the distance")
         sizes = ", ".join(
             f"{100 * value:+.1f} ± {100 * error:.1f} % {way}"
-            for value, error, way in zip(
-                self.terms,
-                self.errors,
-                ("along x", "along y", "with the square of the distance"),
-                strict=True,
-            )
+            for value, error, way in zip(self.terms, self.errors, ways, strict=True)
         )
-        centre = ", ".join(f"{value:.1f}" for value in self.field_px)
-        return (
-            f"masses of the same particles differ over the field, as with a reference whose "
-            f"amplitude changes from the middle to the edge by {sizes}; this is in "
-            f"systematic_mass_kda.  If it is so, set optics.reference_tilt = [{x}, {y}], "
-            f"optics.reference_curvature = {curved} and optics.field_px = [{centre}]"
-        )
+        x, y, curved = self.terms.tolist()
+        field = ", ".join(f"{value:.1f}" for value in self.field_px)
+        return UNEVEN_REFERENCE({"sizes": sizes, "x": x, "y": y, "curved": curved, "field": field})
 
 
 def reference_map(config: Config, table: pd.DataFrame) -> ReferenceMap | None:
@@ -89,7 +75,7 @@ def reference_map(config: Config, table: pd.DataFrame) -> ReferenceMap | None:
     good = table[(table["status"] == Status.OK.value) & (table["sigma_mass_kda"] > 0)]
     relative = (good["sigma_mass_kda"] / good["mass_kda"].abs()).sort_values()
     rows = good.loc[relative.index[:MOST_MASSES]]
-    if len(rows) < LEAST_MASSES:
+    if len(rows) < 20:  # masses without which nothing is asked for
         return None
     mass, x, y = (rows[name].to_numpy(float) for name in ("mass_kda", "x_px", "y_px"))
     sigma = relative.to_numpy(float)[:MOST_MASSES]
@@ -100,20 +86,17 @@ def reference_map(config: Config, table: pd.DataFrame) -> ReferenceMap | None:
     if gain < GAIN or far:
         return None
     rng = np.random.default_rng(len(rows))
-    for _ in range(EXCHANGES):
-        if _fitted(mass, sigma, rng.permutation(place))[1] > gain - CLEARLY:
+    for _ in range(
+        19
+    ):  # exchanges of places, with each of which the masses must agree clearly less
+        # log-likelihood by which that is so
+        if _fitted(mass, sigma, rng.permutation(place))[1] > gain - 8.0:
             return None
     information = -_curvature(mass, sigma, place, terms)
     if not np.all(np.linalg.eigvalsh(information) > 0):
         return None
     errors = np.sqrt(np.diag(np.linalg.inv(information)))
     return ReferenceMap(terms[:-1], np.asarray(errors, dtype=np.float64), field_px)
-
-
-def reference_warning(config: Config, table: pd.DataFrame) -> str:
-    """Say where masses of the same particles differ over the field; empty where they do not."""
-    found = reference_map(config, table)
-    return "" if found is None else found.warning
 
 
 def _field_of(x_px: FloatArray, y_px: FloatArray) -> tuple[float, float, float]:

@@ -10,7 +10,7 @@ import pytest
 
 import iscat_analysis as ia
 from iscat_analysis.config import read_toml
-from iscat_analysis.instrument.microscope import REJECTED_P
+from iscat_analysis.instrument.learning import REJECTED_P
 
 pytestmark = [pytest.mark.large, pytest.mark.usefixtures("sketched")]
 

@@ -53,10 +53,9 @@ def _config(*settings: str) -> Config:
 
 
 def _learned(movie: InstrumentMovie, config: Config) -> tuple[Config, list[str]]:
-    said: list[str] = []
     camera = camera_from_config(config.camera, SHAPE[1:], movie.dtype)
-    learned, _ = learn_optics(movie, config, camera, warn=said.append)
-    return learned, said
+    learned, _, findings = learn_optics(movie, config, camera)
+    return learned, [finding.text for finding in findings]
 
 
 def _analysed(movie: InstrumentMovie, config: Config) -> DetectionResult:

@@ -17,7 +17,7 @@ from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.report import render_report
 from iscat_analysis.report.answer import headline
 from iscat_analysis.search.empty import EmptyField
-from iscat_analysis.trust.empirical_spread import likely_noise
+from iscat_analysis.trust.checks import likely_noise
 
 SIGMAS = 4.0
 LEVEL_E = 1e5

@@ -14,6 +14,7 @@ import pytest
 from scipy.signal import lfilter
 
 from iscat_analysis.config import OpticsCovariance, config_to_toml, load_config
+from iscat_analysis.findings.optics import LONG_IMAGES
 from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.heights import spread_of_heights
@@ -23,9 +24,8 @@ from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import Candidate, FloatArray
 from iscat_analysis.search.dating import StepFrame, common_rise, go_on_rising, locate_step
 from iscat_analysis.search.frames import Patch
-from iscat_analysis.trust.changing_light import at_a_shared_place, in_parts, may_rise
+from iscat_analysis.trust.changing_light import Fluctuation, at_a_shared_place, in_parts, may_rise
 from iscat_analysis.trust.extension import Extension
-from iscat_analysis.trust.fluctuation import Fluctuation
 from iscat_analysis.trust.response import response_of
 
 MASS_KDA, LIGHT_E, TRIALS, SIGMAS = 205.0, 8e6, 40, 4.0
@@ -174,9 +174,9 @@ def test_particles_in_two_halves_are_flagged(apart_nm: float) -> None:
     assert masses.mean() < 0.95 * MASS_KDA
     judged = Extension.of(CONFIG, rows(TRIALS), told, {})
     assert judged.flagged.all()
-    assert "wider than a point's" in judged.message
-    assert "elongated, each in its own direction" in judged.message
-    assert "optics" in replace(judged, is_long=False).message  # which cannot elongate images so
+    assert judged.finding.kind is LONG_IMAGES
+    # optics cannot elongate images so
+    assert "optics" in replace(judged, is_long=False).finding.text
 
 
 # ---- heights of many -------------------------------------------------------------------------
@@ -372,7 +372,7 @@ def test_a_fluctuation_slower_than_windows_shows_in_the_frames_after_them(tau: f
     for seed in range(12):
         found, errors = breathing(0.05, tau, (MASS_KDA,) * 16, seed)
         assert found.is_seen
-        assert "e+" not in found.message
+        assert "e+" not in found.finding.text
         pulls.extend(errors / np.sqrt(9.0 + found.variance_kda2))
         without.extend(errors / 3.0)
     assert np.std(without) > 2.5  # the control

@@ -22,8 +22,7 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.nuisances import Evidence, Pair, evidence_of, pair_of
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import Candidate, FitResult
-from iscat_analysis.trust.extension import Extension
-from iscat_analysis.trust.pairs import told_as_pairs, with_masses_of_pairs
+from iscat_analysis.trust.extension import Extension, told_as_pairs, with_masses_of_pairs
 
 LIGHT_E, SIGMAS = 6e6, 4.0
 GRID = PixelGrid.centred(33, 84.0)
@@ -127,7 +126,7 @@ def test_extended_rows_get_the_mass_of_two_halves_where_these_are_told() -> None
     assert out["status"].tolist() == ["poor_fit", "ok", "poor_fit", "poor_fit"]
     assert left.flagged.tolist() == [True, False, False, False]
     assert left.paired == 2
-    assert "2 rows have the mass of two halves" in left.message
+    assert "2 rows have the mass of two halves" in left.finding.text
     assert left.mass_shift_kda.tolist() == [9.0, 0.0, 0.0, 9.0]
 
 

@@ -10,9 +10,10 @@ import pytest
 
 import iscat_analysis as ia
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.instrument import contrast_sign
-from iscat_analysis.instrument.contrast_sign import wrong_sign
-from iscat_analysis.instrument.fit_optics import Collected, fit_optics
+from iscat_analysis.instrument import learning
+from iscat_analysis.instrument.learning import wrong_sign
+from iscat_analysis.instrument.loop import fit_optics
+from iscat_analysis.instrument.particle_image import Collected
 from iscat_analysis.instrument.result import OpticsCalibration
 
 MASSES = (800.0, 1000.0, 1500.0, 600.0, 1200.0, 2000.0, 900.0, 700.0, 1100.0)
@@ -107,7 +108,7 @@ def test_what_the_movie_does_not_tell_is_not_said_to_go_on(
     ) -> OpticsCalibration:
         return fit_optics(seen, ("focus",), origin)
 
-    monkeypatch.setattr(contrast_sign, "learned_from", the_focus_alone)
+    monkeypatch.setattr(learning, "learned_from", the_focus_alone)
     more = _refused(flat, {**wrong, "optics.na": 1.38})
     assert "as where more than the focus is wrong" in more
     assert "describes the brightest particles best, but not well" in more

@@ -17,13 +17,12 @@ from scipy.ndimage import gaussian_filter, shift
 import iscat_analysis as ia
 from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import Calibration, Config
+from iscat_analysis.findings.optics import OPTICS_LEARNED
 from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.laws import CONDITIONAL
 from iscat_analysis.instrument import learning
-from iscat_analysis.instrument.fit_optics import Collected
-from iscat_analysis.instrument.learning import learn_optics
-from iscat_analysis.instrument.microscope import REJECTED_P, median_p, not_alone
-from iscat_analysis.instrument.particle_image import ParticleImage
+from iscat_analysis.instrument.learning import REJECTED_P, learn_optics, median_p, not_alone
+from iscat_analysis.instrument.particle_image import Collected, ParticleImage
 from iscat_analysis.instrument.uneven import FieldOfView, in_uneven_field
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.parameters import settings_of
@@ -45,8 +44,8 @@ def _learn(
     monkeypatch.setattr(learning, "noise_differs", lambda *_: noise_differs)
     monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (images, []))
     camera = camera_from_config(config.camera, (64, 64), "uint16")
-    said: list[str] = []
-    learned, summary = learn_optics(MOVIE, config, camera, warn=said.append)
+    learned, summary, findings = learn_optics(MOVIE, config, camera)
+    said = [finding.text for finding in findings]
     return learned == config, summary, said
 
 
@@ -124,9 +123,9 @@ def test_pairs_that_land_at_once_do_not_condemn_the_optics(
     images = [*_pairs(changes, 6, 4), *singles]
     monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
     monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (images, []))
-    said: list[str] = []
     camera = camera_from_config(config.camera, (64, 64), "uint16")
-    learned, summary = learn_optics(MOVIE, config, camera, warn=said.append)
+    learned, summary, findings = learn_optics(MOVIE, config, camera)
+    said = [finding.text for finding in findings]
     assert (learned == config) == fits
     assert abs(learned.optics.aberrations_nm.get("z11", 0.0) - changes.get("z11", 0.0)) < 3.0
     assert (summary["median_p"] > REJECTED_P) == fits
@@ -197,7 +196,7 @@ def test_usual_errors_can_be_others(monkeypatch: pytest.MonkeyPatch) -> None:
     known = config.uncertainty.model_copy(update={"optics": {"focus_nm": 2.0}})
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     sure = config.model_copy(update={"uncertainty": known})
-    _, summary = learn_optics(MOVIE, sure, camera, warn=lambda _: None)
+    summary = learn_optics(MOVIE, sure, camera).summary
     assert _sigma(summary, "focus_nm") == pytest.approx(2.0)
     assert _sigma(summary, "na") == pytest.approx(0.01)
     with pytest.raises(ia.ConfigError, match="focus cannot be learned: give some of focus_nm"):
@@ -216,8 +215,8 @@ def test_a_phase_that_the_line_of_masses_turns_is_told(
         update={"calibration": Calibration(gradient_per_kda=-3.1e-5)}
     )
     camera = camera_from_config(config.camera, (64, 64), "uint16")
-    said: list[str] = []
-    learned, summary = learn_optics(MOVIE, config, camera, warn=said.append)
+    learned, summary, findings = learn_optics(MOVIE, config, camera)
+    said = [finding.text for finding in findings]
     phase = learned.optics.reference_phase_deg
     assert summary["calibrated"]
     assert abs(learned.optics.focus_nm - focus_nm) < 50
@@ -252,10 +251,10 @@ def test_always_is_told_where_nothing_is_learned_from_such_movies(
     camera = camera_from_config(_config("always").camera, (64, 64), "uint16")
     for calibrate in ("always", "auto"):
         config = ia.configure(settings={"optics.calibrate": calibrate, **settings})
-        said: list[str] = []
-        assert learn_optics(MOVIE, config, camera, warn=said.append) == (config, {})
-        assert len(said) == (calibrate == "always")
-        assert not said or reason in said[0]
+        learned, summary, findings = learn_optics(MOVIE, config, camera)
+        assert (learned, summary) == (config, {})
+        assert len(findings) == (calibrate == "always")
+        assert all(reason in finding.text for finding in findings)
 
 
 def test_never_looks_at_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -293,9 +292,9 @@ def test_neither_rings_of_neighbours_nor_the_gain_condemn_the_optics(
         update={"camera": config.camera.model_copy(update={"well_depth_e": 1e9})}
     )
     camera = camera_from_config(unsaturated.camera, grid.shape, counts.dtype)
-    said: list[str] = []
     movie: Any = Stack(counts)
-    _, summary = learn_optics(movie, unsaturated, camera, warn=said.append)
+    _, summary, findings = learn_optics(movie, unsaturated, camera)
+    said = [finding.text for finding in findings]
     assert summary["tested"] == 6
     assert summary["calibrated"] == (focus_nm < -400.0)
     assert bool(said) == bool(said_first)
@@ -313,11 +312,9 @@ def test_particles_at_heights_of_their_own_do_not_condemn_the_optics(
     monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
     monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (images, []))
     camera = camera_from_config(config.camera, (64, 64), "uint16")
-    said: list[str] = []
-    assert learn_optics(MOVIE, free, camera, warn=said.append) == (free, {})
-    assert not said
-    learn_optics(MOVIE, config, camera, warn=said.append)  # the control: one height for all
-    assert said[0].startswith("optics learned from the movie")
+    assert learn_optics(MOVIE, free, camera) == (free, {}, ())
+    control = learn_optics(MOVIE, config, camera)  # one height for all
+    assert control.findings[0].kind is OPTICS_LEARNED
 
 
 @pytest.mark.parametrize(
@@ -335,14 +332,11 @@ def test_edges_of_a_pattern_that_moved_are_not_learned_from(moved_px: float, why
     counts = rng.poisson(np.repeat([light, later], 10, axis=0)).astype(np.uint32)
     camera = config.camera.model_copy(update={"well_depth_e": 1e9})
     unsaturated = config.model_copy(update={"camera": camera})
-    said: list[str] = []
     movie: Any = Stack(counts)
-    _, summary = learn_optics(
-        movie, unsaturated, camera_from_config(camera, (64, 64), counts.dtype), warn=said.append
-    )
-    assert not summary["calibrated"]
-    assert len(said) == 1
-    assert why in said[0]
+    found = learn_optics(movie, unsaturated, camera_from_config(camera, (64, 64), counts.dtype))
+    assert not found.summary["calibrated"]
+    (finding,) = found.findings
+    assert why in finding.text
 
 
 def test_a_median_has_its_own_noise_when_optics_are_tested(tmp_path: Path) -> None:

@@ -13,8 +13,7 @@ from iscat_analysis.config import Config, config_to_toml, configure, load_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.instrument.microscope import goodness
-from iscat_analysis.instrument.particle_image import ParticleImage, place_particle_images
+from iscat_analysis.instrument.particle_image import ParticleImage, goodness, place_particle_images
 from iscat_analysis.instrument.template import fit_own, fit_picture
 from iscat_analysis.optics.forward import (
     ForwardModel,

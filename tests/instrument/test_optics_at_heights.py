@@ -12,7 +12,7 @@ from scenes import Stack
 
 from iscat_analysis.camera import camera_from_config, measure_windows
 from iscat_analysis.config import load_config
-from iscat_analysis.instrument import sources
+from iscat_analysis.instrument import loop
 from iscat_analysis.instrument.loop import learn
 from iscat_analysis.instrument.result import OpticsCalibration
 
@@ -56,7 +56,7 @@ def _learned(counts: np.ndarray, mode: str, focus_nm: float = -500.0) -> OpticsC
     camera = camera_from_config(config.camera, counts.shape[1:], counts.dtype)
     windows = measure_windows(Stack(counts), camera, (0, FRAMES), (FRAMES, 2 * FRAMES))
     with ThreadPoolExecutor(2) as pool:
-        field = sources.WholeField(windows, config, pool)
+        field = loop.WholeField(windows, config, pool)
         return learn(field, config, ("focus", "na"), {"movie": "movie"}, pool.map).outcome
 
 
@@ -80,5 +80,5 @@ def test_particles_taken_for_ones_on_the_glass_teach_nothing(
     movie: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Control."""
-    monkeypatch.setattr(sources, "ROUNDS", 1)
+    monkeypatch.setattr(loop, "ROUNDS", 1)
     assert not _learned(movie[0], "mass").accepted

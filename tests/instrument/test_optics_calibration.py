@@ -13,11 +13,15 @@ from calibrations import GRID, PHOTONS, configuration, make_particle_images, mic
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.instrument.fit_optics import Collected, fit_optics
+from iscat_analysis.findings.optics import ODD_APERTURE
 from iscat_analysis.instrument.joint_fit import maximise
+from iscat_analysis.instrument.loop import fit_optics
 from iscat_analysis.instrument.measure import HELD_OUT_P, Measured, OpticsSearch
-from iscat_analysis.instrument.microscope import build_microscope
-from iscat_analysis.instrument.particle_image import average_particle_images
+from iscat_analysis.instrument.particle_image import (
+    Collected,
+    average_particle_images,
+    build_microscope,
+)
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.parameters import (
     PARAMETERS,
@@ -203,16 +207,15 @@ def test_a_wrong_pixel_size_is_suspected() -> None:
     ]
     found = fit_optics(Collected(larger, stretched), ROUND, {"movie": "m.tif"})
     assert isinstance(found, OpticsCalibration)
-    (note,) = [line for line in found.notes if "camera.pixel_size_nm" in line]
-    guess = float(note.partition("pixels of about ")[2].split()[0])
-    assert guess == pytest.approx(pixel, rel=0.005)
+    (note,) = [one for one in found.notes if one.kind is ODD_APERTURE]
+    assert note.values["pixel_nm"] == pytest.approx(pixel, rel=0.005)
     fine = fit_optics(Collected(said, images), ROUND, {"movie": "m.tif"})
-    assert not any("camera.pixel_size_nm" in line for line in fine.notes)
+    assert not any(one.kind is ODD_APERTURE for one in fine.notes)
     # where it is the aperture that is wrong, light beyond the critical angle says so
     engraved = fit_optics(Collected(configuration(na=1.38), images), ROUND, {"movie": "m.tif"})
     assert isinstance(engraved, OpticsCalibration)
     assert engraved.value("na") == pytest.approx(1.42, abs=SIGMAS * engraved.sigma("na"))
-    assert not any("camera.pixel_size_nm" in line for line in engraved.notes)
+    assert not any(one.kind is ODD_APERTURE for one in engraved.notes)
 
 
 def test_what_the_pictures_do_not_tell_stays_as_configured_with_its_usual_error() -> None:

@@ -13,8 +13,8 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.laws import CONDITIONAL, POISSON, NoiseLaw
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.instrument.joint_fit import _Point, _walls, maximise
+from iscat_analysis.instrument.measure import search_starts
 from iscat_analysis.instrument.particle_image import PRIVATE, ParticleImage, average_particle_images
-from iscat_analysis.instrument.starts import search_starts
 from iscat_analysis.optics.parameters import free_groups, optics_limits, settings_of, with_settings
 from iscat_analysis.optics.pixels import PixelGrid
 

@@ -11,8 +11,8 @@ import pytest
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.instrument import loop
-from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.loop import Rounds, learn
+from iscat_analysis.instrument.particle_image import Collected
 
 CONFIG = Config.model_validate({"optics": {"focus_nm": -300.0}})
 

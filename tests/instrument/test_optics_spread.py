@@ -10,8 +10,7 @@ from instruments import Instrument, Pictures
 from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.laws import CONDITIONAL
 from iscat_analysis.instrument.joint_fit import maximise
-from iscat_analysis.instrument.microscope import build_microscope
-from iscat_analysis.instrument.particle_image import ParticleImage, with_masses
+from iscat_analysis.instrument.particle_image import ParticleImage, build_microscope, with_masses
 from iscat_analysis.optics.parameters import settings_of
 from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.records import FloatArray

@@ -9,8 +9,8 @@ import pytest
 from calibrations import configuration, make_particle_images
 
 from iscat_analysis.instrument.joint_fit import maximise
-from iscat_analysis.instrument.microscope import REJECTED_P, goodness, median_p, microscopes
-from iscat_analysis.instrument.score_test import ScoreTest, score_test
+from iscat_analysis.instrument.learning import REJECTED_P, ScoreTest, median_p, score_test
+from iscat_analysis.instrument.particle_image import goodness, microscopes
 from iscat_analysis.optics.parameters import Prior, prior_of, settings_of
 
 COUNT = 8

@@ -86,7 +86,7 @@ def _movie(optics: Optics, seed: int, **light: float) -> UnevenMovie:
 def _learned(movie: UnevenMovie) -> tuple[Config, dict[str, tuple[float, float]]]:
     config = _config()
     camera = camera_from_config(config.camera, SHAPE[1:], movie.dtype)
-    learned, told = learn_optics(movie, config, camera, warn=lambda _: None)
+    learned, told, _ = learn_optics(movie, config, camera)
     rows = {each["parameter"]: each for each in told.get("parameters", ())}
     errors = {
         name: (learned.optics.field_term(name), rows[name]["sigma"])

@@ -11,6 +11,8 @@ from scipy.ndimage import gaussian_filter
 import iscat_analysis as ia
 from iscat_analysis.camera import Camera, find_law, measure_transfer
 from iscat_analysis.config import Config
+from iscat_analysis.fitting import events
+from iscat_analysis.landing import measured_images
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.search.noise import measure_motion
 from iscat_analysis.study import write_stack
@@ -96,3 +98,36 @@ def test_what_lands_is_no_flicker_and_no_motion(seed: int) -> None:
     assert transfer.flicker is None
     assert find_law(transfer).kind == "linear"
     assert measure_motion(counts, Camera(), 40) < 0.01
+
+
+def test_spheres_are_given_up_where_none_describes_the_brightest_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten points in optics that are wrong: eight were tried twice.  Control: good optics."""
+    tried: list[str] = []
+    for where in (measured_images, events):
+        monkeypatch.setattr(
+            where, "recognised", lambda *_, at=where.__name__, **__: tried.append(at)
+        )
+    points = [{"frame": 60 + 16 * k, "x_px": 16.0 + 19.2 * (k % 4), "y_px": 16.0 + 26.4 * (k // 4),
+               "mass_kda": 4500.0} for k in range(10)]  # fmt: skip
+    truth = ia.configure(
+        {
+            "optics": {"focus_nm": -300.0, "attenuation": 0.1, "calibrate": "never"},
+            "camera": {"pixel_size_nm": 90.0, "gain_e_per_adu": 1.0, "offset_adu": 0.0},
+            "particle": {"mass_kda": 4500.0},
+            "background": {"method": "sliding", "window_frames": 30},
+            "posterior": {"enabled": False},
+            "simulation": {
+                "shape": [88, 80], "frames": 240, "photons_per_pixel": 3e4, "events": points,
+            },
+        }
+    )  # fmt: skip
+    movie = tmp_path / "movie.tif"
+    write_stack(truth, movie, seed=7)
+    for focus_nm, most in ((-300.0, 0), (-150.0, 2 * events.IN_VAIN)):
+        tried.clear()
+        wrong = ia.configure(truth, settings={"optics.focus_nm": focus_nm})
+        fit_stack(movie, wrong, out=tmp_path / f"at {focus_nm:g}")
+        assert len(tried) == most
+        assert set(tried) <= {measured_images.__name__}

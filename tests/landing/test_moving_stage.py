@@ -53,9 +53,10 @@ def _config(*, follows: bool) -> Config:
 
 
 def _learned(*, follows: bool) -> tuple[Config, list[str]]:
-    movie, config, said = _movie(), _config(follows=follows), []
+    movie, config = _movie(), _config(follows=follows)
     camera = camera_from_config(config.camera, SHAPE[1:], movie.dtype)
-    return learn_optics(movie, config, camera, warn=said.append)[0], said
+    learned, _, findings = learn_optics(movie, config, camera)
+    return learned, [finding.text for finding in findings]
 
 
 def test_optics_are_learned_with_the_motion_divided_out() -> None:

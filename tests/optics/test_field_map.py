@@ -13,8 +13,7 @@ from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.inference.counts import asimov_poisson
-from iscat_analysis.instrument.microscope import build_microscope
-from iscat_analysis.instrument.particle_image import ParticleImage
+from iscat_analysis.instrument.particle_image import ParticleImage, build_microscope
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.local import WEIGHTS, LocalModels, Spot
 from iscat_analysis.optics.parameters import FIELD, settings_of

@@ -30,8 +30,8 @@ from iscat_analysis.optics.scatterers import (
 )
 from iscat_analysis.records import PARAMETERS, with_diameters
 from iscat_analysis.report.answer import as_diameters
-from iscat_analysis.trust.assumed import assumed_error
 from iscat_analysis.trust.response import response_of
+from iscat_analysis.trust.systematic import assumed_error
 from iscat_analysis.units import sphere_mass_kda
 from tests.rays import picture_of_rays
 

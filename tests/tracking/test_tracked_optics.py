@@ -18,9 +18,9 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.findings import Findings
 from iscat_analysis.instrument import loop
-from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.joint_fit import excess
 from iscat_analysis.instrument.loop import Round, Rounds
+from iscat_analysis.instrument.particle_image import Collected
 from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.optics.parameters import settings_of, with_settings
 from iscat_analysis.tracking.optics import (

@@ -14,6 +14,7 @@ from report_factory import make_analysis
 from scenes import PIXEL_NM, make_config
 from scipy.stats import norm
 
+from iscat_analysis.findings.optics import LESS_NOISE, SCALED_SIGMA, UNDERSTATED_SIGMA
 from iscat_analysis.inference import counts as noise
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
@@ -37,7 +38,7 @@ from iscat_analysis.report.tables import event_table
 from iscat_analysis.search.empty import CONTRASTS, EmptyField
 from iscat_analysis.species.tables import event_table as events_of
 from iscat_analysis.species.tables import sentences
-from iscat_analysis.trust.empirical_spread import likely_noise, measured_scale, spread_verdict
+from iscat_analysis.trust.checks import likely_noise, measured_scale, spread_verdict
 
 SIGMAS = 4.0
 GRID = PixelGrid.region((0, 32), (0, 32), PIXEL_NM)
@@ -285,13 +286,16 @@ def _achieved(
 )
 def test_the_noise_is_named(found: EmpiricalSpread, pixels: float, word: str) -> None:
     assert word in likely_noise(found, {"noise_variance_over_shot": [pixels]})
-    verdict = spread_verdict({"mass_kda": found}, {}, scaled=False)
+    verdict, said = spread_verdict({"mass_kda": found}, {}, scaled=False)
+    assert said is not None
+    assert said.kind is UNDERSTATED_SIGMA
     assert verdict["understated"]
     assert f"{found.over_crb:.2f} (" in verdict["message"]
     assert "wrong model" not in verdict["message"]
-    scaled = spread_verdict({"mass_kda": found}, {}, scaled=True)
+    scaled, said = spread_verdict({"mass_kda": found}, {}, scaled=True)
     assert not scaled["understated"]
-    assert "is scaled" in scaled["message"]
+    assert said is not None
+    assert said.kind is SCALED_SIGMA
 
 
 def test_slow_noise_of_a_rejected_model_may_be_its_rings() -> None:
@@ -310,10 +314,11 @@ def test_what_helps_against_a_drift_depends_on_what_frames_stand_against() -> No
 
 
 def test_a_clean_movie_is_told_nothing() -> None:
-    assert spread_verdict({"mass_kda": _achieved(1.01)}, {}, scaled=False)["message"] == ""
-    less = spread_verdict({"mass_kda": _achieved(0.85)}, {}, scaled=False)
+    assert spread_verdict({"mass_kda": _achieved(1.01)}, {}, scaled=False)[1] is None
+    less, said = spread_verdict({"mass_kda": _achieved(0.85)}, {}, scaled=False)
     assert not less["understated"]
-    assert "less noise" in less["message"]
+    assert said is not None
+    assert said.kind is LESS_NOISE
 
 
 def test_sigma_is_scaled_up_and_never_down() -> None:

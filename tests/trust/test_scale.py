@@ -21,8 +21,14 @@ from iscat_analysis.inference.counts import counts_likelihood
 from iscat_analysis.inference.laws import CONDITIONAL
 from iscat_analysis.optics.forward import PixelGrid, forward_model, signed_peak
 from iscat_analysis.records import EVENT_COLUMNS, Status
-from iscat_analysis.trust.budget import budget_of, explained_kda, width_warning
-from iscat_analysis.trust.systematic import contributions, misfit_error, total
+from iscat_analysis.trust.systematic import (
+    budget_of,
+    contributions,
+    explained_kda,
+    misfit_error,
+    total,
+    wide_species,
+)
 
 GRADIENT, MASS, LIGHT, FRAMES = -3.1e-5, 205.0, 3e6, 100
 PIXEL_NM = 84.4
@@ -290,7 +296,7 @@ def test_the_budget_has_the_camera(
     offset: dict[str, Any], expected: dict[str, tuple[float, str]]
 ) -> None:
     camera = {**MEASURED, "offset_adu": MEASURED["offset_adu"] | offset}
-    found = contributions(_config(), _event(), camera=camera)
+    found = contributions(_config(), _event(), summary={"camera": camera})
     budget = budget_of(_event(), found, {}, unknown=None, scaled=False)
     lines = {one["name"].split(",")[0]: one for one in budget if "camera" in one["name"]}
     assert lines.pop("gain of the camera")["sigma_rel"] == 0  # it changes sigma alone
@@ -299,7 +305,7 @@ def test_the_budget_has_the_camera(
     shares = np.hypot.reduce([size for size, _ in expected.values()])
     contrast = abs(float(_event()["contrast"][0]))
     for config in (_config(), _config().model_copy(update={"calibration": None})):
-        whole = contributions(config, _event(), camera=camera)
+        whole = contributions(config, _event(), summary={"camera": camera})
         told = total([each for each in whole if "camera" in each[0].name], 1).get("contrast")
         assert told == (None if config.calibration else pytest.approx(shares * contrast))
     said = {name.removesuffix(" of the camera") if "lin" in name else name: one
@@ -326,11 +332,11 @@ def test_what_passes_a_threshold_is_too_large_by_what_the_budget_says(over: floa
 def test_a_width_that_nothing_explains_is_said() -> None:
     one = {"mass_kda": 92.0, "width_kda": 5.0, "width_low": 4.0, "width_high": 6.0, "count": 50,
            "spread_over_sigma": 1.5, "explained_kda": 0.0}  # fmt: skip
-    assert "92 kDa is wider than the budget explains: 5.4 %" in width_warning(
-        [one], calibrated=True
-    )
-    assert width_warning([one | {"explained_kda": 4.5}], calibrated=True) == ""
-    assert width_warning([one | {"width_low": 0.5}], calibrated=True) == ""
+    found = wide_species([one], calibrated=True)
+    assert found is not None
+    assert "92 kDa is wider than the budget explains: 5.4 %" in found.text
+    assert wide_species([one | {"explained_kda": 4.5}], calibrated=True) is None
+    assert wide_species([one | {"width_low": 0.5}], calibrated=True) is None
 
 
 def _pictures(share: float, noise: float, *, seed: int) -> pd.DataFrame:

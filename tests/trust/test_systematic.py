@@ -26,8 +26,7 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import conditional, counts_likelihood
 from iscat_analysis.inference.laws import CONDITIONAL
 from iscat_analysis.instrument.joint_fit import Estimate, maximise
-from iscat_analysis.instrument.microscope import build_microscope
-from iscat_analysis.instrument.particle_image import ParticleImage
+from iscat_analysis.instrument.particle_image import ParticleImage, build_microscope
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.parameters import FREE, PRIMARY, free_names, prior_of, settings_of
 from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, PARAMETERS, FloatArray
@@ -278,8 +277,9 @@ def test_a_doubt_about_the_field_grows_from_its_centre() -> None:
 
     def error(name: str, sigma: float) -> float:
         tested = {"names": [name], "covariance": [[sigma**2]], "field_px": [48.0, 48.0, 48.0]}
-        assert contributions(config, table, optics=tested | {"calibrated": True}) == []
-        found = contributions(config, table, optics=tested | {"calibrated": False})
+        for learned in (True, False):
+            found = contributions(config, table, {"optics": tested | {"calibrated": learned}})
+            assert bool(found) != learned
         return float({s.name: e for s, e in found}["optics as configured"]["mass_kda"][0])
 
     assert error("focus_curvature_nm", 8.0) == pytest.approx(error("focus_nm", 8.0 * 0.5**2))

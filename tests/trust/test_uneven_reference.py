@@ -8,7 +8,7 @@ import pytest
 
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.trust.systematic import contributions, total
-from iscat_analysis.trust.uneven_reference import TERMS, reference_map, reference_warning
+from iscat_analysis.trust.uneven_reference import TERMS, reference_map
 
 SIDE_PX = 200.0
 SPECIES_KDA = (146.0, 480.0)
@@ -47,7 +47,7 @@ def test_a_reference_that_changes_is_found(terms: tuple[float, float, float]) ->
     left = np.abs(found.share(table["x_px"], table["y_px"])) * table["mass_kda"]
     shared = total(contributions(config, table), len(table))["mass_kda"]
     assert np.all(shared > 0.9 * left)  # it is among the errors that rows have in common
-    assert "set optics.reference_tilt" in reference_warning(config, table)
+    assert "set optics.reference_tilt" in found.finding.text
 
 
 @pytest.mark.parametrize("broad", [False, True])
