@@ -113,6 +113,12 @@ class Camera:
         return np.maximum(read, rounding)
 
 
+def full_scale_of(dtype: DTypeLike) -> float | None:
+    """Give the largest number that a type of integers has; None of floats."""
+    stored = np.dtype(dtype)
+    return float(np.iinfo(stored).max) if np.issubdtype(stored, np.integer) else None
+
+
 def float_type(stored: np.dtype[Any]) -> np.dtype[Any]:
     """Type of what is computed from counts: single precision where these have 16 bits or fewer."""
     return np.dtype(np.float32 if stored.itemsize <= 2 else np.float64)
@@ -148,14 +154,13 @@ def padded_bits(counts: NDArray[Any]) -> int:
 
 def camera_from_config(config: CameraConfig, shape_yx: tuple[int, int], dtype: DTypeLike) -> Camera:
     """Build the camera that a configuration describes, reading its maps."""
-    config, stored = config.assumed, np.dtype(dtype)
-    full_scale = float(np.iinfo(stored).max) if np.issubdtype(stored, np.integer) else None
+    config = config.assumed
     return Camera(
         gain_e_per_adu=_number_or_map(config.gain_e_per_adu, "gain_e_per_adu", shape_yx),
         offset_adu=_number_or_map(config.offset_adu, "offset_adu", shape_yx),
         read_noise_e=_number_or_map(config.read_noise_e, "read_noise_e", shape_yx),
         well_depth_e=config.well_depth_e,
-        full_scale_adu=full_scale,
+        full_scale_adu=full_scale_of(dtype),
     )
 
 
@@ -220,8 +225,7 @@ def check_counts(
     Shapes: `counts` (t, y, x).
     """
     if camera is None:
-        integer = np.issubdtype(counts.dtype, np.integer)
-        camera = Camera(full_scale_adu=float(np.iinfo(counts.dtype).max) if integer else None)
+        camera = Camera(full_scale_adu=full_scale_of(counts.dtype))
     lowest, highest = counts.min(axis=(1, 2)), counts.max(axis=(1, 2))
     floor = _negative_floor_adu(camera, counts.dtype)
     ceiling = _ceiling_adu(camera)

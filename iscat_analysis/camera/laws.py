@@ -50,7 +50,7 @@ import pandas as pd
 from numpy.typing import DTypeLike, NDArray
 from scipy.optimize import least_squares
 
-from iscat_analysis.camera.counts import Camera, converter_ceiling, float_type
+from iscat_analysis.camera.counts import Camera, converter_ceiling, float_type, full_scale_of
 from iscat_analysis.camera.transfer import SIGMAS, TOLERANCE, Transfer
 from iscat_analysis.config import CameraConfig
 from iscat_analysis.errors import DataError
@@ -323,8 +323,7 @@ def full_scale(config: CameraConfig, dtype: DTypeLike) -> float | None:
     """Largest number that a pixel can have: the end of the curve, or of the stored type."""
     if config.response is not None:
         return read_response(Path(config.response)).full
-    stored = np.dtype(dtype)
-    return float(np.iinfo(stored).max) if np.issubdtype(stored, np.integer) else None
+    return full_scale_of(dtype)
 
 
 def read_response(path: Path) -> Response:

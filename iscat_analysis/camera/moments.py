@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from iscat_analysis.camera.counts import converter_ceiling
+from iscat_analysis.camera.counts import Camera, full_scale_of
 from iscat_analysis.errors import DataError
 from iscat_analysis.medians import robust_sigma
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource
@@ -150,10 +150,7 @@ def saturated(highest: NDArray[Any], name: str) -> BoolArray:
     Shapes: `highest` (y, x), result (y, x).
     """
     top = float(highest.max())
-    ceiling = converter_ceiling(highest)
-    if np.issubdtype(highest.dtype, np.integer):
-        ceiling = min(ceiling, float(np.iinfo(highest.dtype).max))
-    full: BoolArray = highest >= ceiling
+    full = Camera(full_scale_adu=full_scale_of(highest.dtype)).saturated(highest)
     if full.mean() > 0.5:
         raise DataError(
             f"{name}: {100 * full.mean():.0f} % of the pixels are saturated (count {top:g}); "

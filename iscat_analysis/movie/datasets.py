@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
 from iscat_analysis.movie.containers import SHOWN_NAMES, name_one
-from iscat_analysis.movie.descriptions import Hints, merge, positive
+from iscat_analysis.movie.descriptions import Hints, merge
 from iscat_analysis.movie.hdf5 import Hdf5Reader, StoredArray
 from iscat_analysis.movie.mapped import Writer, refuse_changed
+from iscat_analysis.movie.side_files import positive
 from iscat_analysis.movie.stack import Frames
 from iscat_analysis.records import StackMetadata
 
@@ -44,47 +45,34 @@ class _Dialect:
     """Names of datasets in one generation of files."""
 
     frames: str
-    keyframes: str | None
+    keyframes: str
     rate: str
+    exposure: str
     frame_binning: str
     pixel_binning: str
-    exposure: str
     names: tuple[str, ...]
     instrument: str | None
 
 
+_ACQ = "configuration/Devices/AcqCam/"
+_ENGINE = "configuration/Engines/AcqMovieEngine/"
+_TWO_MP = "movie/configuration/acq_camera/"
+_NAMES = ("movie/device_serials/InstrumentName", "movie/device_info/InstrumentName")
 _DIALECTS = (
     _Dialect(
-        frames="frame",
-        keyframes=None,
-        rate="configuration/Devices/AcqCam/FrameRate",
-        frame_binning="configuration/Engines/AcqMovieEngine/FrameBinning",
-        pixel_binning="configuration/Engines/AcqMovieEngine/PixelBinning",
-        exposure="configuration/Devices/AcqCam/ExposureTime",
-        names=("device_info/InstrumentName",),
-        instrument="Refeyn OneMP",
+        "frame", "", f"{_ACQ}FrameRate", f"{_ACQ}ExposureTime", f"{_ENGINE}FrameBinning",
+        f"{_ENGINE}PixelBinning", ("device_info/InstrumentName",), "Refeyn OneMP",
     ),
     _Dialect(
-        frames="movie/frame",
-        keyframes="movie/keyframe",
-        rate="movie/configuration/acq_camera/frame_rate",
-        frame_binning="movie/configuration/acq_camera/frame_binning",
-        pixel_binning="movie/configuration/acq_camera/pixel_binning",
-        exposure="movie/configuration/acq_camera/exposure_time",
-        names=("movie/device_serials/InstrumentName", "movie/device_info/InstrumentName"),
-        instrument="Refeyn TwoMP",
+        "movie/frame", "movie/keyframe", f"{_TWO_MP}frame_rate", f"{_TWO_MP}exposure_time",
+        f"{_TWO_MP}frame_binning", f"{_TWO_MP}pixel_binning", _NAMES, "Refeyn TwoMP",
     ),
     _Dialect(
-        frames="movie/frame",
-        keyframes="movie/keyframe",
-        rate="movie/configuration/Devices/AcqCam/FrameRate",
-        frame_binning="movie/configuration/Devices/AcqCam/SoftwareFrameBinning",
-        pixel_binning="movie/configuration/Devices/AcqCam/SoftwarePixelBinning",
-        exposure="movie/configuration/Devices/AcqCam/ExposureTime",
-        names=("movie/device_info/InstrumentName", "movie/device_serials/InstrumentName"),
-        instrument=None,
+        "movie/frame", "movie/keyframe", f"movie/{_ACQ}FrameRate", f"movie/{_ACQ}ExposureTime",
+        f"movie/{_ACQ}SoftwareFrameBinning", f"movie/{_ACQ}SoftwarePixelBinning", _NAMES[::-1],
+        None,
     ),
-)
+)  # fmt: skip
 
 
 class DatasetFrames:
@@ -210,7 +198,7 @@ def _open_refeyn(reader: Hdf5Reader, path: Path) -> DatasetFrames:
             f"file of {len(reader.data)}; the file is damaged, export it again"
         )
     frames = DatasetFrames(stored, reader)
-    if stored.dtype.kind == "u" and dialect.keyframes is not None:
+    if stored.dtype.kind == "u" and dialect.keyframes:
         frames = _differences(reader, dialect, stored, path) or frames
     frames.metadata, frames.notes = _described(reader, dialect, path)
     return frames
@@ -224,7 +212,7 @@ def _differences(
     The last keyframe decides: it is among plain frames as it is, and differences must add up to
     it.  Without keyframes, an attribute ``encoding`` marks differences.
     """
-    known = _last_keyframe(reader, dialect.keyframes or "", stored, path)
+    known = _last_keyframe(reader, dialect.keyframes, stored, path)
     if known is not None and np.array_equal(stored.read(known[0], known[0] + 1)[0], known[1]):
         return None
     if known is None and not reader.has_attribute(dialect.frames, "encoding"):

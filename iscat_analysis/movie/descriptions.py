@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.side_files import told_by
+from iscat_analysis.movie.side_files import inverse, positive, told_by
 from iscat_analysis.records import FloatArray, StackMetadata
 
 # |mean exp(2πi f t)| of times that tell the clock; a jitter of 0.19 intervals
@@ -325,22 +325,6 @@ def plain_hints(resolution: Resolution | None) -> Hints:
     x_nm, y_nm = (_RESOLUTION_UNIT_NM[resolution[2]] / per for per in resolution[:2])
     known = StackMetadata(x_nm, source="tiff") if _plausible(x_nm, y_nm) else StackMetadata()
     return Hints(known, y_nm)
-
-
-def positive(value: object, factor: float = 1.0) -> float | None:
-    """Read a number; None unless it is finite and positive."""
-    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
-        return None
-    try:
-        number = float(value) * factor
-    except (ValueError, OverflowError):
-        return None
-    return number if math.isfinite(number) and number > 0 else None
-
-
-def inverse(value: float | None) -> float | None:
-    """Convert an interval to a rate, or back."""
-    return None if value is None else positive(1 / value)
 
 
 def merge(hints: Sequence[Hints], path: Path) -> StackMetadata:

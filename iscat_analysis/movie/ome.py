@@ -23,12 +23,10 @@ from iscat_analysis.movie.descriptions import (
     TIME_S,
     Hints,
     chosen_rate,
-    inverse,
     measure_clock,
-    positive,
     time_axis,
 )
-from iscat_analysis.movie.side_files import LARGEST_NA, told_by
+from iscat_analysis.movie.side_files import LARGEST_NA, inverse, positive, told_by
 from iscat_analysis.reading import is_file
 from iscat_analysis.records import StackMetadata
 

@@ -132,13 +132,23 @@ def _number(value: object) -> float | None:
     """Read a number above zero, as of ``2``, ``"2x2"`` or ``{"PropVal": "2"}``."""
     if isinstance(value, dict):
         value = value.get("PropVal")
+    return positive(value.lower().partition("x")[0] if isinstance(value, str) else value)
+
+
+def positive(value: object, factor: float = 1.0) -> float | None:
+    """Read a number; None unless it is finite and positive."""
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         return None
     try:
-        number = float(value.lower().partition("x")[0] if isinstance(value, str) else value)
+        number = float(value) * factor
     except (ValueError, OverflowError):
         return None
     return number if math.isfinite(number) and number > 0 else None
+
+
+def inverse(value: float | None) -> float | None:
+    """Convert an interval to a rate, or back."""
+    return None if value is None else positive(1 / value)
 
 
 _ENDS = (".json", ".txt", ".dat", ".pfs", "_settings.dat", "_metadata.txt")
