@@ -1,6 +1,6 @@
 """Arrays that were used last, as many as have room: what is used again soon is not made again.
 
-A cache for results that take long to compute and are needed again.
+`memoize` keeps results of a function that take long to compute.
 """
 
 from __future__ import annotations

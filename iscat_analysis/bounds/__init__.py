@@ -3,7 +3,7 @@
 `quantum` holds what the collected light knows, `holevo` what one measurement can take of it for
 several parameters at once, `classical` what the camera can learn of it, and `experiment` plans a
 measurement from a configuration; `shared` says what an uncertain microscope leaves in every
-particle; `scan` varies one thing, `planning` turns the question round, `pupil` searches the
+particle; `planning` varies one thing and turns the question round, `pupil` searches the
 measurement that comes nearest to the light's own bound, and `paper` reproduces Dong et al. (2021).
 """
 

@@ -1,13 +1,11 @@
-"""Bounds along one axis of an experiment.
+"""Planning an experiment: bounds along one axis, the best setting, and what a precision takes.
 
 The light that falls on the particle is held: where the attenuation or the pixel size changes, the
 background per pixel follows (β² and pixel area); the scattered photons stay.  A calibration belongs
 to the configured optics: it fixes how strongly a mass scatters, there and along the scan.
 
-Planning an experiment: the best setting, the photons a target takes, and where precision goes.
-
-All three ask the question of `plan` and `event_bounds` backwards; the bound they speak of is the
-joint one over the free parameters of the mode.
+`optimize`, `effort` and `budget` ask the question of `plan` and `event_bounds` backwards; the bound
+they speak of is the joint one over the free parameters of the mode.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""Search for the best pupil: its variables, its figure of merit, and descents from starts.
-
-Which pupil would come nearest to what the light allows.
+"""Which pupil would come nearest to what the light allows.
 
 Reference phase, attenuation, mask, focus and low Zernike terms are searched for the smallest
 

@@ -6,9 +6,8 @@ particle does to imitate the change of the picture.  A covariance Σ of the micr
 D Σ Dᵀ.  The same blocks say what the particle tells of the microscope once its own unknowns are
 fitted, I_pp − I_pθ I_θθ⁻¹ I_θp.
 
-How well particles would tell the microscope, before they are recorded.
-
-The information that each expected picture holds about the optics, once the particle's own place,
+`forecast_optics` says how well particles would tell the microscope, before they are recorded.  The
+information that each expected picture holds about the optics, once the particle's own place,
 mass and level are fitted, adds up over the pictures, with that of the prior; the inverse of the sum
 is the covariance that `iscat calibrate optics` will report.  What it leaves in the masses and
 heights of later fits follows from `iscat_analysis.bounds.shared`.

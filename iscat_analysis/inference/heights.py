@@ -11,13 +11,11 @@ data and 1/s² of the prior; of its inverse are the errors, and the bound, which
 The prior is that of a nuisance and not cut off at z = 0: where it reaches below, the picture is
 continued analytically, so that estimates stay regular and errors those of the information.
 
-Mean and spread of the heights of many particles, which their prior is made of.
-
-A movie tells the prior of its heights itself (empirical Bayes: H. Robbins, Proc. 3rd Berkeley Symp.
-1, 157, 1956).
-Each event has its own estimate z_i with variance v_i, from its score with respect to z and its
-information once all else is fitted.  With heights of mean μ and variance s² these are normal
-about μ with variance s² + v_i, and the likelihood of μ and s² is a product over the events.
+`spread_of_heights` finds mean and spread of the heights of many particles.  A movie tells the prior
+of its heights itself (empirical Bayes: H. Robbins, Proc. 3rd Berkeley Symp. 1, 157, 1956). Each
+event has its own estimate z_i with variance v_i, from its score with respect to z and its
+information once all else is fitted.  With heights of mean μ and variance s² these are normal about
+μ with variance s² + v_i, and the likelihood of μ and s² is a product over the events.
 """
 
 from __future__ import annotations

@@ -6,10 +6,9 @@ of covariance Σ, because it wiggles or has parts that are apart.  With u the sc
 their information once everything that was fitted follows, I⁻¹u estimates them, and uᵀI⁻¹u tests
 whether they are there (Rao's score test; C. R. Rao, Proc. Camb. Phil. Soc. 44, 50, 1948).
 
-A particle of two equal halves: its mass, and the distance and direction of the halves.
-
-For small h the image of `Halves` is s + ½ hhᵀ·∇∇s, s that of a point: a covariance of places of one
-direction, which starts the fit.  ±h are one particle.
+`pair_of` fits two equal halves: their mass, distance and direction.  For small h the image of
+`Halves` is s + ½ hhᵀ·∇∇s, s that of a point: a covariance of places of one direction, which starts
+the fit.  ±h are one particle.
 
 Twice the gain in log-likelihood over a point tests for two halves.  Pairs are special cases of a
 covariance of places, which has three parameters, so that by chance the gain is at most χ² of three

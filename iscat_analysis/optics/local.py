@@ -13,7 +13,7 @@ Over one picture, a fiftieth of the field, they count as constant.  The derivati
 coefficient is that with respect to the parameter times the function, so that fit, learner and bound
 need no more than `WEIGHTS`.
 
-Models of a microscope that is not the same everywhere in the field, or in all frames.
+`LocalModels` gives the model of a place and a frame.
 """
 
 from __future__ import annotations

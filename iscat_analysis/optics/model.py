@@ -4,13 +4,10 @@ Simulation, fits, posterior and bounds all use `ForwardModel`.  Its *signal* is
 the contrast C in the interferometric schemes and |E_sca|² for unit incident amplitude in dark field
 (D21, section II; physics.md, sections 1–3 and 8).
 
-Scattered light that the pupil collects, as an area and in photons (physics.md, section 1).
+Beside it are the scattered light that the pupil collects, as an area and in photons (physics.md,
+section 1), and images of particles that move during the exposure.
 
-Images of several particles of one kind on the same pixels.
-
-Images of particles that move during the exposure.
-
-An image is the average along the path.  During the exposure E, free diffusion has the variance
+Such an image is the average along the path.  During the exposure E, free diffusion has the variance
 D E/3 along each axis about the mean position: the variance 2Dt about the start averages to D E, and
 that of the mean is 2D E/3.  At time t of the exposure the position is normal about the mean, with
 the variance v(t) = 2D E (1/3 − t/E + t²/E²), which averages to q = D E/3.  Each plane wave of the

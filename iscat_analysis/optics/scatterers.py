@@ -1,4 +1,4 @@
-"""Refractive indices of the particles, with their sources.
+"""What particles are: their refractive indices, spheres and shells, and rods.
 
 Gold: P. B. Johnson and R. W. Christy, Phys. Rev. B 6, 4370 (1972), n and k against photon energy,
 interpolated linearly in vacuum wavelength.  Silica: I. H. Malitson, J. Opt. Soc. Am. 55, 1205

@@ -6,12 +6,12 @@ linear, and its pictures at the amplitude a are those of the sphere.  Derivative
 are analytic.  Those along a are differences between masses that differ by `MASS_STEP` of the mass;
 their error is 1e-6 of the derivative, and 1e-5 of the second one.
 
-Images of spheres that stand on the coverslip: one number gives their size and their height.
-
-The image of a small sphere shows its brightness and, by its phase, the height of its centre.  A
-sphere that touches the coverslip has its centre one radius above it, so that a known refractive
-index leaves the diameter as the only parameter beside the place, as the mass is of a dipole.  Which
-of several materials it is follows from the image: each brightness goes with one height.
+`SeatedModel` is of spheres that stand on the coverslip: one number gives their size and their
+height.  The image of a small sphere shows its brightness and, by its phase, the height of its
+centre.  A sphere that touches the coverslip has its centre one radius above it, so that a known
+refractive index leaves the diameter as the only parameter beside the place, as the mass is of a
+dipole.  Which of several materials it is follows from the image: each brightness goes with one
+height.
 
 The parameter z of these models is the gap between the sphere and the coverslip.
 """

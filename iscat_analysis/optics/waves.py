@@ -4,12 +4,11 @@ Two tables have the same interface.  If only the polarisation gives the pupil a 
 `RadialField`: quintics along r.  Any other pupil has a `LatticeField`.  Both give the kernels a
 profile at a height, a table of profiles along z, and the field at any point.
 
-Analytic derivatives of the signal with respect to the parameters of the microscope.
-
-Every parameter of the optics changes the light of each ray in the pupil.  The derivative of the
-field is the integral of this change: a factor inside the pupil, and the light on an edge that moves
-(aperture, mask).  Each derivative is tabulated on the lattice of the field, once for each height,
-and combined with the field at the pixels.
+Derivatives with respect to the microscope are analytic.  Every parameter of the optics changes the
+light of each ray in the pupil.  The derivative of the field is the integral of this change: a
+factor inside the pupil, and the light on an edge that moves (aperture, mask).  Each derivative is
+tabulated on the lattice of the field, once for each height, and combined with the field at the
+pixels.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Arguments of the functions of arrays: microscope, particle, camera, and arrays to broadcast.
+"""Arguments of the functions of arrays, checked once.
 
-Counts before and after, or contrasts, of regions, checked once, and the likelihood of each.
+Microscope, particle and camera; arrays to broadcast; counts before and after, or contrasts, of
+regions, and the likelihood of each.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Images of a particle.
-
-Bounds for arrays of set-ups.
-"""
+"""Images of a particle, and bounds of its estimates, for arrays of set-ups."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Fits of many regions of interest, into one table.
-
-The log-likelihood of one region, for any sampler or optimiser.
-"""
+"""Regions of interest: fits of many into one table, and the log-likelihood of one."""
 
 from __future__ import annotations
 
