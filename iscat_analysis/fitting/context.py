@@ -94,7 +94,7 @@ class AnalysisContext:
         """Give the spheres that a particle among proteins may be, in a model's microscope."""
         fit, optics = self.config.fit, self.config.optics
         absolute = optics.convention == "exact" and optics.emission == "reciprocal"
-        proteins = fit.mode == "mass" and self.config.particle.kind == "protein"
+        proteins = not fit.heights_free and self.config.particle.kind == "protein"
         if not (proteins and absolute) or model.is_measured or self.additive:
             return ()
         if model is self.model:
@@ -151,8 +151,8 @@ def make_context(
 ) -> AnalysisContext:
     """Build the models and the matched filter for a field."""
     pixel, roi_px = square_of(config, field_px)
-    darkfield = config.optics.scheme == "darkfield"
-    if config.fit.likelihood == "conditional" and (darkfield or not is_counted(config)):
+    counted = config.optics.interferes and config.background.is_counted
+    if config.fit.likelihood == "conditional" and not counted:
         raise ConfigError(
             'fit.likelihood = "conditional" needs an interferometric scheme and '
             'background.method = "fixed" or "sliding": use "auto"'
@@ -246,11 +246,6 @@ def reported_steps(context: AnalysisContext) -> int:
 def variance_of_background(config: Config) -> float:
     """Give the variance of the background over that of the mean of its frames."""
     return _VARIANCE_OF_BACKGROUND[str(config.background.method)]
-
-
-def is_counted(config: Config) -> bool:
-    """Tell whether the background is a sum of counts, as the conditional likelihood assumes."""
-    return config.background.method in ("fixed", "sliding")
 
 
 def _pixel_nm(config: Config) -> float:

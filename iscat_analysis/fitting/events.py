@@ -19,7 +19,7 @@ from scipy.ndimage import gaussian_filter
 from iscat_analysis.camera import smooth_background
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.particles import INDEX_UNKNOWN
-from iscat_analysis.fitting.context import AnalysisContext, is_counted
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.inference.common_size import fit_index
 from iscat_analysis.inference.counts import MEAN, choose_noise, counts_likelihood
 from iscat_analysis.inference.likelihood import Likelihood
@@ -131,8 +131,8 @@ def region_likelihood(
         background=context.background_variance,
         noise=choose_noise(
             config.fit.likelihood,
-            interferes=config.optics.scheme != "darkfield",
-            counted=is_counted(config),
+            interferes=config.optics.interferes,
+            counted=config.background.is_counted,
         ),
         scale_e=photons_scale(context, windows) if context.additive else None,
         others=others,

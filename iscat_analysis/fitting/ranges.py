@@ -15,35 +15,31 @@ way         frames                                                              
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.camera import Camera, Check, check_counts, measure_windows
-from iscat_analysis.config import ALL, Config
+from iscat_analysis.config import ALL, Config, Way
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import FrameSource, Progress, Windows, silent
 from iscat_analysis.search.frames import cut_off
 from iscat_analysis.units import count
 
-BackgroundMode = Literal["fixed", "sliding", "tracks"]
+BackgroundMode = Way
 
 
 def background_mode(config: Config) -> BackgroundMode:
-    """Tell which frames are compared with which."""
-    method = config.background.method
-    if method == "sliding":
-        if config.fit.likelihood == "poisson":
-            raise ConfigError(
-                'fit.likelihood = "poisson" takes the background for known, but background.method '
-                '= "sliding" measures it: use "auto", give the frames before the particles as '
-                'background.frames = [0, 200], or a known level with background.method = "known"'
-            )
-        return "sliding"
-    learnt = method == "tracks" or config.background.frames == ALL
-    return "tracks" if learnt else "fixed"
+    """Background mode of a configuration: fixed, sliding or tracks."""
+    if config.background.slides and config.fit.likelihood == "poisson":
+        raise ConfigError(
+            'fit.likelihood = "poisson" takes the background for known, but background.method '
+            '= "sliding" measures it: use "auto", give the frames before the particles as '
+            'background.frames = [0, 200], or a known level with background.method = "known"'
+        )
+    return config.background.way
 
 
 def describe_background_mode(config: Config) -> str:
@@ -66,10 +62,10 @@ def describe_background_mode(config: Config) -> str:
 def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, tuple[int, int]]:
     """Give the ranges of frames that are background, and that are fitted."""
     before = config.background.recorded
-    if config.background.method == "tracks":  # in dark field: all frames are both
+    if config.background.learnt_with_tracks:  # in dark field: all frames are both
         before = fitted_frames(movie, config)
         return before, before
-    if config.background.method == "known":
+    if config.background.is_known:
         before = None
     elif before is None:
         raise ConfigError(
@@ -90,10 +86,10 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
 
 def _without_frames_before(config: Config) -> str:
     """Name the backgrounds that need no frames before the particles."""
-    if config.optics.scheme == "darkfield":
+    if not config.optics.interferes:
         learnt = '; without such frames background.method = "tracks" learns it with the tracks'
-        return learnt if config.fit.mode == "track" else ""
-    if config.fit.mode == "track":
+        return learnt if config.fit.follows_tracks else ""
+    if config.fit.follows_tracks:
         return (
             '; without such frames background.method = "tracks" learns the background with the '
             'tracks, and background.frames = "all" takes the median of all frames, or with '
@@ -148,8 +144,8 @@ def measured_windows(
 
     return measure_windows(
         movie, camera, before, after,
-        median=background.method in ("median", "tracks"), level_e=background.level_e,
-        overlap=background.method == "tracks",
+        median=not (background.is_counted or background.is_known), level_e=background.level_e,
+        overlap=background.learnt_with_tracks,
         power_normalization=background.power_normalization,
-        check=refuse if config.optics.scheme == "darkfield" else check, progress=progress,
+        check=check if config.optics.interferes else refuse, progress=progress,
     )  # fmt: skip

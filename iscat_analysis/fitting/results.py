@@ -20,6 +20,7 @@ from iscat_analysis.pieces.regions import line_of
 from iscat_analysis.records import (
     DIPOLE,
     FRAME_COLUMN,
+    FREE_PARAMETERS,
     NO_MODEL,
     Clip,
     EventView,
@@ -112,7 +113,7 @@ def evidence_beside(
 
     Shapes: result (n, 11), in the order of `Evidence`.
     """
-    if context.mode != "mass":
+    if "z_nm" in FREE_PARAMETERS[context.mode]:
         return np.full((len(events), len(NOTHING)), np.nan)
     rows = mapper(lambda event: evidence_of(event.likelihood, event.fit, event.rise), events)
     return np.array(list(rows)).reshape(-1, len(NOTHING))

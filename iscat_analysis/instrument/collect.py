@@ -15,7 +15,7 @@ import numpy as np
 from iscat_analysis.camera import Camera, check_counts
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis import NoiseSurvey, judge_window
-from iscat_analysis.fitting.context import is_counted, variance_of_background
+from iscat_analysis.fitting.context import variance_of_background
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.ranges import (
     background_mode,
@@ -297,7 +297,7 @@ def _cutter(windows: Windows, config: Config) -> Callable[[int, int, int], Parti
         likelihood = counts_likelihood(
             model, grid, windows.before_e[cut], windows.after_e[cut], ratio,
             background=variance_of_background(config),
-            noise=choose_noise("auto", interferes=True, counted=is_counted(config)),
+            noise=choose_noise("auto", interferes=True, counted=config.background.is_counted),
             read_variance_before_e2=windows.read_variance_before_e2[cut],
             read_variance_after_e2=windows.read_variance_after_e2[cut],
             masked=windows.masked[cut],

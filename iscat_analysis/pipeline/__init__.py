@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from iscat_analysis.calibration import with_standards
 from iscat_analysis.camera import text_summary
@@ -161,11 +162,18 @@ def analyse(
         run = Run(notify, progress, partial, executor or LocalExecutor(), inject)
         kind = kind_of(config)
         ready = prepare(movie, config, run)  # load, calibrate
-        kind.refuse(run, movie.name)
+        if kind.inject is None:
+            _refuse_injection(run, movie.name)
         found = kind.find(ready, run)  # background, detect, fit, posterior, bounds
         with parts_kept(partial if kind.keeps_parts else None):
-            extra, stopped = kind.inject(ready, run, found)
-            stopped = stopped or found.interrupted
+            extra: dict[str, Any] = {}
+            stopped = found.interrupted
+            if kind.inject and run.inject and not stopped:
+                try:
+                    extra = {"injection": kind.inject(ready, run, found)}
+                except KeyboardInterrupt:
+                    stopped = True
+                run.clock.lap("injection")
             return make_analysis(
                 kind, ready, run, found, extra,
                 command=command, started=started, interrupted=stopped,
@@ -248,3 +256,14 @@ def _with_standards(config: Config, state: Prepared) -> Config:
             "`iscat calibrate mass` writes a line with its optics"
         )
     return found
+
+
+def _refuse_injection(run: Run, name: str) -> None:
+    """Refuse to inject particles, and say that workers are idle, where windows do not slide."""
+    if run.executor.distant:
+        run.notify(f"{name}: is analysed in this process: only landing movies have chunks")
+    if run.inject:
+        raise ConfigError(
+            f"`inject` = {run.inject}: particles are added to landing movies only, which have an "
+            'interferometric scheme and background.method = "sliding"; leave it out'
+        )

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import zip_longest
 from typing import Any
 
@@ -56,7 +56,8 @@ from iscat_analysis.fitting.run import Run
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.landing.split_frames import field_repeats
 from iscat_analysis.movie import Stack
-from iscat_analysis.pipeline.kinds import Kind, Look, Redraw, candidate_table, with_threshold
+from iscat_analysis.pipeline.kinds import Kind, Look, candidate_table, with_threshold
+from iscat_analysis.pipeline.stored import StoredResult
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     Candidate,
@@ -95,119 +96,101 @@ class Background:
     doubt: str
 
 
-class BeforeAfter(Kind):
-    """What is there in all frames after a background, and was not before."""
+Fit = Callable[[Prepared, Run, Background, ThreadPoolExecutor], DetectionResult]
+"""Fits what is there in the frames after a background."""
 
-    heading = "background"
-    keeps_parts = False
-    still = True
-    """Whether particles stay where they are in all frames."""
 
-    def find(self, ready: Prepared, run: Run) -> DetectionResult:
-        """Find particles in the frames after the background; see `Kind`."""
-        ready, windows = _sum_frames(ready, run)
-        ground = self._judged(ready, run, windows)
-        with threads(ready.config.compute.workers) as pool:
-            found = self.fitted(ready, run, ground, pool)
-        run.clock.lap("results")
-        return found if ready.kept is None else ready.kept.put_back(found)
+def find_before_after(ready: Prepared, run: Run, fit: Fit) -> DetectionResult:
+    """Find particles in the frames after a background."""
+    ready, windows = _sum_frames(ready, run)
+    ground = _judged(ready, run, windows)
+    with threads(ready.config.compute.workers) as pool:
+        found = fit(ready, run, ground, pool)
+    run.clock.lap("results")
+    return found if ready.kept is None else ready.kept.put_back(found)
 
-    def preview(self, ready: Prepared) -> BeforeAfterSearch:
-        """Compare some frames with the background; see `Kind`."""
-        return BeforeAfterSearch(self, ready)
 
-    def redraw(
-        self,
-        ready: Prepared,
-        table: pd.DataFrame,
-        tracks: pd.DataFrame | None,
-        summary: Mapping[str, Any],
-    ) -> Redraw:
-        """Draw events over the background; see `Kind`."""
-        del tracks, summary
-        return StoredEvents(self, ready, table).draw
+def background_context(ready: Prepared, windows: Windows) -> tuple[AnalysisContext, Noise]:
+    """Judge the noise of the background, and make models and filter for it."""
+    config, after = ready.config, windows.frames_after
+    still = not config.fit.follows_tracks
+    noise = judge_background(
+        ready.steady, ready.camera, windows, still=still, additive=not config.optics.interferes
+    )
+    searches = 1 if still else after[1] - after[0]
+    context = make_context(
+        config, ready.shape, searches=searches, noise=noise.spectrum, lines=ready.lines
+    )
+    return context, noise
 
-    def context(
-        self, ready: Prepared, windows: Windows, after: tuple[int, int]
-    ) -> tuple[AnalysisContext, Noise]:
-        """Judge the noise of the background, and make models and filter for it."""
-        config = ready.config
-        noise = judge_background(
-            ready.steady, ready.camera, windows,
-            still=self.still, additive=not config.optics.interferes,
-        )  # fmt: skip
-        context = make_context(
-            config, ready.shape, searches=1 if self.still else after[1] - after[0],
-            noise=noise.spectrum, lines=ready.lines,
-        )  # fmt: skip
-        return context, noise
 
-    def fitted(
-        self, ready: Prepared, run: Run, ground: Background, pool: ThreadPoolExecutor
-    ) -> DetectionResult:
-        """Fit the particles that are there in all frames, and sample their posteriors."""
-        context = ground.context
-        events, windows = fit_field(
-            context, ground.windows, excess_noise=ground.noise.excess, pool=pool,
-            progress=run.progress,
-        )  # fmt: skip
-        if context.config.fit.index:
-            found = list(pool.map(lambda event: with_index(context, event), events))
-            events = tuple(event for event, _ in found)
-            untold = [told for _, told in found if told]
-            run.report(index_finding(context, untold, len(untold), len(events)))
-        run.clock.lap("fit")
-        # rings of many particles that a wrong microscope leaves over look uneven too
-        cause = misfit_warning(context.config, events)
-        misfit = MODEL_MISFITS({"cause": cause}) if cause else None
-        run.report(misfit or _uneven_finding(context, ready.steady.name, windows, events))
-        repeats, empty = field_repeats(context, ready.steady, ready.camera, windows, events)
-        if context.config.fit.sigma != "measured":
-            events, changing = _flag_changing_masses(context.mode, events, repeats)
-            if changing:
-                which = count(changing, "event")
-                run.report(MASSES_CHANGE({"events": which, "sigmas": CHANGES}))
-        run.clock.lap("repeats")
-        chains: list[PosteriorResult] = []
-        interrupted = False
-        if context.config.samples_posterior:
-            chains, interrupted = _sample_posteriors(context, events, pool, run.progress)
-            run.clock.lap("posterior")
-        return DetectionResult(
-            context=context,
-            fits=table_of(context, events),
-            evidence=evidence_beside(context, events),
-            views=tuple(
-                view_of(number, event, posterior=chain)
-                for number, (event, chain) in enumerate(zip_longest(events, chains))
-            ),
-            image=contrast_image(context, windows),
-            compared=Compared.of(windows),
-            summary=ground.summary,
-            repeats=tuple(repeats),
-            empty=empty,
-            interrupted=interrupted,
-        )
+def fit_together(
+    ready: Prepared, run: Run, ground: Background, pool: ThreadPoolExecutor
+) -> DetectionResult:
+    """Fit the particles that are there in all frames, and sample their posteriors."""
+    context = ground.context
+    events, windows = fit_field(
+        context, ground.windows, excess_noise=ground.noise.excess, pool=pool,
+        progress=run.progress,
+    )  # fmt: skip
+    if context.config.fit.index:
+        found = list(pool.map(lambda event: with_index(context, event), events))
+        events = tuple(event for event, _ in found)
+        untold = [told for _, told in found if told]
+        run.report(index_finding(context, untold, len(untold), len(events)))
+    run.clock.lap("fit")
+    # rings of many particles that a wrong microscope leaves over look uneven too
+    cause = misfit_warning(context.config, events)
+    misfit = MODEL_MISFITS({"cause": cause}) if cause else None
+    run.report(misfit or _uneven_finding(context, ready.steady.name, windows, events))
+    repeats, empty = field_repeats(context, ready.steady, ready.camera, windows, events)
+    if context.config.fit.sigma != "measured":
+        events, changing = _flag_changing_masses(context.mode, events, repeats)
+        if changing:
+            which = count(changing, "event")
+            run.report(MASSES_CHANGE({"events": which, "sigmas": CHANGES}))
+    run.clock.lap("repeats")
+    chains: list[PosteriorResult] = []
+    interrupted = False
+    if context.config.samples_posterior:
+        chains, interrupted = _sample_posteriors(context, events, pool, run.progress)
+        run.clock.lap("posterior")
+    return DetectionResult(
+        context=context,
+        fits=table_of(context, events),
+        evidence=evidence_beside(context, events),
+        views=tuple(
+            view_of(number, event, posterior=chain)
+            for number, (event, chain) in enumerate(zip_longest(events, chains))
+        ),
+        image=contrast_image(context, windows),
+        compared=Compared.of(windows),
+        summary=ground.summary,
+        repeats=tuple(repeats),
+        empty=empty,
+        interrupted=interrupted,
+    )
 
-    def _judged(self, ready: Prepared, run: Run, windows: Windows) -> Background:
-        """Make the models, and judge noise, pixels and drift of the background."""
-        movie, config = ready.steady, ready.config
-        context, noise = self.context(ready, windows, windows.frames_after)
-        run.warm_up(context)
-        run.clock.lap("model")
-        repeated = None if self.still else repeats_warning(movie, windows)
-        uneven = None if self.still else uneven_warning(config, movie.name, windows)
-        summary: dict[str, Any] = {}
-        moved = None
-        if not context.additive:
-            summary = examine_background(movie, ready.camera, windows)
-            summary["noise_spectrum"] = noise.summary
-            moved = drift_warning(movie.name, summary)
-        run.report(*noise.findings_of(movie.name), *pixel_warnings(*windows.left_out))
-        run.report(repeated, uneven, moved)
-        run.clock.lap("background")
-        doubt = uneven or moved
-        return Background(context, windows, noise, summary, doubt.text if doubt else "")
+
+def _judged(ready: Prepared, run: Run, windows: Windows) -> Background:
+    """Make the models, and judge noise, pixels and drift of the background."""
+    movie, config, still = ready.steady, ready.config, not ready.config.fit.follows_tracks
+    context, noise = background_context(ready, windows)
+    run.warm_up(context)
+    run.clock.lap("model")
+    repeated = None if still else repeats_warning(movie, windows)
+    uneven = None if still else uneven_warning(config, movie.name, windows)
+    summary: dict[str, Any] = {}
+    moved = None
+    if not context.additive:
+        summary = examine_background(movie, ready.camera, windows)
+        summary["noise_spectrum"] = noise.summary
+        moved = drift_warning(movie.name, summary)
+    run.report(*noise.findings_of(movie.name), *pixel_warnings(*windows.left_out))
+    run.report(repeated, uneven, moved)
+    run.clock.lap("background")
+    doubt = uneven or moved
+    return Background(context, windows, noise, summary, doubt.text if doubt else "")
 
 
 def _sum_frames(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
@@ -231,7 +214,7 @@ def _sum_frames(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
 class BeforeAfterSearch:
     """Searches for particles that were not in the background."""
 
-    def __init__(self, kind: BeforeAfter, ready: Prepared) -> None:
+    def __init__(self, ready: Prepared) -> None:
         self._movie, self._config, self._camera = ready.steady, ready.config, ready.camera
         self._check = checked(self._movie, self._camera)
         before, after = frame_ranges(self._movie, self._config)
@@ -239,12 +222,12 @@ class BeforeAfterSearch:
         numbers = None if ready.kept is None else ready.kept.numbers
         self._numbers = np.arange(ready.whole.shape[0]) if numbers is None else numbers
         self.frames = self._in_file(after)
-        self.window = self.longest if kind.still else 1
+        self.window = 1 if self._config.fit.follows_tracks else self.longest
         self._windows = measured_windows(
             self._movie, self._config, self._camera, before, (after[0], after[0] + 1)
         )
         whole = replace(self._windows, n_after=self.longest, frames_after=after)
-        self._context, _ = kind.context(ready, whole, after)
+        self._context, _ = background_context(ready, whole)
 
     def _in_file(self, span: tuple[int, int]) -> tuple[int, int]:
         """Give the numbers in the file of a range of the frames that are left."""
@@ -299,19 +282,20 @@ class BeforeAfterSearch:
 class StoredEvents:
     """Draws rows over a background of other frames: all together, or each in its frame."""
 
-    def __init__(self, kind: BeforeAfter, ready: Prepared, table: pd.DataFrame) -> None:
-        self._kind, self._ready, self.table = kind, ready, table
+    def __init__(self, ready: Prepared, result: StoredResult) -> None:
+        self.ready, self.table = ready, result.table
+        self._still = not ready.config.fit.follows_tracks
         self.before, self.after = frame_ranges(ready.steady, ready.config)
         self.context = self.made_context()
         self._opened = lru_cache(1)(self._open)
 
     def made_context(self) -> AnalysisContext:
         """Make the models."""
-        return make_context(self._ready.config, self._ready.shape, lines=self._ready.lines)
+        return make_context(self.ready.config, self.ready.shape, lines=self.ready.lines)
 
     def sums(self, span: tuple[int, int]) -> Windows:
         """Sum some frames over the background."""
-        ready = self._ready
+        ready = self.ready
         return measured_windows(ready.steady, ready.config, ready.camera, self.before, span)
 
     def _drawn(self, region: Region, rows: Sequence[int]) -> FloatArray:
@@ -323,31 +307,31 @@ class StoredEvents:
 
     @property
     def _field(self) -> Region:
-        rows, columns = self._ready.shape
+        rows, columns = self.ready.shape
         return Region((0, rows), (0, columns))
 
     def _open(self, span: tuple[int, int]) -> tuple[Windows, list[int]]:
         """Give the sums, with the light that the particles leave, and the rows in them."""
         windows, table, context = self.sums(span), self.table, self.context
         rows = table.index[table["mass_kda"].notna() & is_event(table)]
-        frames, still = table["frame"], self._kind.still
+        frames, still = table["frame"], self._still
         here = [int(i) for i in rows if still or int(frames.iloc[i]) == span[0]]
-        if self._ready.config.background.power_normalization:
+        if self.ready.config.background.power_normalization:
             signal = context.left(self._drawn(self._field, here))
             if context.additive:
                 signal = signal * photons_scale(context, windows)
             windows = refine_power(windows, signal, additive=context.additive)
         return windows, here
 
-    def draw(self, row: int) -> EventView:
+    def __call__(self, row: int) -> EventView:
         """Draw a row of the table."""
         table, context = self.table, self.context
         frame = int(table["frame"].iloc[row])
-        windows, here = self._opened(self.after if self._kind.still else (frame, frame + 1))
+        windows, here = self._opened(self.after if self._still else (frame, frame + 1))
         x_nm, y_nm, z_nm, mass = _place(table.iloc[row])
         pixel = context.pixel_nm
         start = Candidate(x_nm / pixel, y_nm / pixel, z_nm, mass, float(table["snr"].iloc[row]))
-        region = region_around(context.roi_px, self._ready.shape, start)
+        region = region_around(context.roi_px, self.ready.shape, start)
         others = self._drawn(region, [i for i in here if i != row])
         if context.lines is not None:
             taken = context.lines.taken(self._drawn(self._field, here))
@@ -420,3 +404,9 @@ def _sample_posteriors(
         pool.shutdown(cancel_futures=True)
         return done, True
     return done, False
+
+
+BEFORE_AFTER = Kind(
+    "background", partial(find_before_after, fit=fit_together), BeforeAfterSearch, StoredEvents,
+    keeps_parts=False,
+)  # fmt: skip

@@ -423,7 +423,7 @@ def _distribution(
 
     The matched filter's standard deviation is what its snr makes of each mass.
     """
-    if "mass_kda" not in FREE_PARAMETERS[context.mode] or context.mode == "track":
+    if "mass_kda" not in FREE_PARAMETERS[context.mode] or MODES[context.mode].follows_tracks:
         return None
     mass, sigma = (good[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
     efficiency = None
@@ -516,7 +516,7 @@ def reported_rows(
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)
     table = make_rows(fits, columns)
-    if mode == "mass":  # what is no dipole has no mass, and no error of one
+    if "z_nm" not in FREE_PARAMETERS[mode]:  # what is no dipole has no mass, and no error of one
         kinds = table.columns.intersection(["repeat_mass_kda", "systematic_mass_kda"])
         table[kinds] = table[kinds].where(table["mass_kda"].notna(), np.nan, axis=0)
     if config.fits_sizes:

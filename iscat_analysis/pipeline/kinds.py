@@ -1,17 +1,14 @@
 """Kinds of movie, each an object that knows how its movies are searched, fitted, shown and redrawn.
 
-`kind_of` asks once which frames are compared with which.  Everything after it asks the kind: `find`
-searches and fits, `preview` searches the frames that one is looking at, `redraw` makes the images
-of stored rows again, `heading` names its part of ``summary.json``.
+`kind_of` asks once which frames are compared with which, and everything after it asks the kind.
 """
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import pandas as pd
@@ -25,6 +22,9 @@ from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.records import EventView, FloatArray
 from iscat_analysis.report import EVENT_FIGURES
+
+if TYPE_CHECKING:
+    from iscat_analysis.pipeline.stored import StoredResult
 
 FOUND_COLUMNS = ("x_px", "y_px", "snr", "contrast", "mass_kda")
 """Columns of what a `Look` finds."""
@@ -99,13 +99,22 @@ class Search(Protocol):
         """Search the frames around one."""
 
 
-class Kind(ABC):
+@dataclass(frozen=True)
+class Kind:
     """A kind of movie.
 
     Attributes
     ----------
     heading : str
         Its part of ``summary.json``.
+    find : callable
+        Measures the background, searches, and fits what is there.
+    search : callable
+        Prepares the search of the frames that one is looking at.
+    stored : callable
+        Prepares the images of stored rows.
+    inject : callable or None
+        Adds known particles and analyses the movie again; None where none can be added.
     event_figures : int
         Events that are drawn for print.
     keeps_parts : bool
@@ -113,63 +122,28 @@ class Kind(ABC):
     """
 
     heading: str
-    event_figures = EVENT_FIGURES
-    keeps_parts = True
-
-    @abstractmethod
-    def find(self, ready: Prepared, run: Run) -> DetectionResult:
-        """Measure the background, search, and fit what is there."""
-
-    @abstractmethod
-    def preview(self, ready: Prepared) -> Search:
-        """Prepare the search of a few frames."""
-
-    @abstractmethod
-    def redraw(
-        self,
-        ready: Prepared,
-        table: pd.DataFrame,
-        tracks: pd.DataFrame | None,
-        summary: Mapping[str, Any],
-    ) -> Redraw:
-        """Make the function that draws the rows of a stored result."""
-
-    def refuse(self, run: Run, name: str) -> None:
-        """Refuse to inject particles, and say that workers are idle, where windows do not slide."""
-        if run.executor.distant:
-            run.notify(f"{name}: is analysed in this process: only landing movies have chunks")
-        if run.inject:
-            raise ConfigError(
-                f"`inject` = {run.inject}: particles are added to landing movies only, which have "
-                'an interferometric scheme and background.method = "sliding"; leave it out'
-            )
-
-    def inject(
-        self, ready: Prepared, run: Run, found: DetectionResult
-    ) -> tuple[dict[str, Any], bool]:
-        """Summarise how added particles are found, and whether that was interrupted."""
-        del ready, run, found
-        return {}, False
+    find: Callable[[Prepared, Run], DetectionResult]
+    search: Callable[[Prepared], Search]
+    stored: Callable[[Prepared, StoredResult], Redraw]
+    inject: Callable[[Prepared, Run, DetectionResult], dict[str, Any]] | None = None
+    event_figures: int = EVENT_FIGURES
+    keeps_parts: bool = True
 
 
 def kind_of(config: Config) -> Kind:
     """Give the kind of a movie; each takes a while to import."""
     match background_mode(config):
         case "sliding":
-            from iscat_analysis.pipeline.landings import Landing
-
-            return Landing()
+            from iscat_analysis.pipeline.landings import LANDING as KIND
+        case "tracks" if config.optics.interferes:
+            from iscat_analysis.pipeline.moving import MOVING as KIND
         case "tracks":
-            from iscat_analysis.pipeline.moving import Moving, MovingInDarkField
-
-            return Moving() if config.optics.interferes else MovingInDarkField()
-        case "fixed" if config.fit.follows_tracks:
-            from iscat_analysis.pipeline.moving import FrameByFrame
-
-            return FrameByFrame()
-    from iscat_analysis.pipeline.before_after import BeforeAfter
-
-    return BeforeAfter()
+            from iscat_analysis.pipeline.moving import MOVING_IN_DARK_FIELD as KIND
+        case _ if config.fit.follows_tracks:
+            from iscat_analysis.pipeline.moving import FRAME_BY_FRAME as KIND
+        case _:
+            from iscat_analysis.pipeline.before_after import BEFORE_AFTER as KIND
+    return KIND
 
 
 def with_threshold(context: AnalysisContext, threshold: float) -> AnalysisContext:

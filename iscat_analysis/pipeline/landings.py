@@ -11,7 +11,7 @@ remains.  Every particle lands, and leaves again three windows later.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import Any
@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.sliding import contrast_map
 from iscat_analysis.bounds import power_searched
 from iscat_analysis.camera import LARGEST_PX, Camera, CutFrames, LightModel, Mover, Trajectory
-from iscat_analysis.config import Config
 from iscat_analysis.diagnosis import Prepared, survey_over, within
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext, make_context, reported_steps
@@ -34,13 +33,14 @@ from iscat_analysis.fitting.results import DetectionResult, view_of
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.landing.chunks import view_moved
-from iscat_analysis.landing.find import find_landings
+from iscat_analysis.landing.find import analyse_landings, find_landings
 from iscat_analysis.landing.maps import SidelobeFilter
 from iscat_analysis.landing.neighbours import Neighbours, Step
 from iscat_analysis.landing.tasks import StepEvent, TaskBuilder, patch_of, trace_of
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.finish import reported_rows
-from iscat_analysis.pipeline.kinds import Kind, Look, Redraw, candidate_table
+from iscat_analysis.pipeline.kinds import Kind, Look, candidate_table
+from iscat_analysis.pipeline.stored import StoredResult
 from iscat_analysis.records import (
     FRAME_COLUMN,
     Candidate,
@@ -169,12 +169,11 @@ def _with_particle(
     return changed.astype(counts.dtype)
 
 
-def inject_and_recover(
-    movie: CountSource, config: Config, camera: Camera, result: DetectionResult, run: Run
-) -> dict[str, Any]:
+def inject_and_recover(ready: Prepared, run: Run, result: DetectionResult) -> dict[str, Any]:
     """Add known particles to a movie, analyse it again and compare."""
-    from iscat_analysis.landing.find import analyse_landings
-
+    config, movie, camera = result.context.config, ready.movie, ready.camera
+    if ready.stretches.breaks:  # a stretch tells what the others would
+        config = within(config, ready.stretches.main)
     frames = fitted_frames(movie, config)
     window = int(result.summary["window_frames"])
     fixed = config.background.model_copy(update={"window_frames": window})
@@ -325,53 +324,6 @@ def recovery(
 _WINDOWS_KEPT = 16  # lengths of window whose models are remembered
 
 
-class Landing(Kind):
-    """What lands or leaves between windows that slide over a movie."""
-
-    heading = "landing"
-
-    event_figures = 2  # the page shows hundreds
-
-    def find(self, ready: Prepared, run: Run) -> DetectionResult:
-        """Find steps in each stretch of the movie; see `Kind`."""
-        return find_landings(ready, run)
-
-    def preview(self, ready: Prepared) -> LandingSearch:
-        """Compare windows before and after a frame; see `Kind`."""
-        return LandingSearch(ready)
-
-    def redraw(
-        self,
-        ready: Prepared,
-        table: pd.DataFrame,
-        tracks: pd.DataFrame | None,
-        summary: Mapping[str, Any],
-    ) -> Redraw:
-        """Draw the windows before and after each step; see `Kind`."""
-        del tracks
-        return StoredSteps(ready, table, summary).draw
-
-    def refuse(self, run: Run, name: str) -> None:
-        """Refuse nothing: chunks go to workers, and particles can be added."""
-
-    def inject(
-        self, ready: Prepared, run: Run, found: DetectionResult
-    ) -> tuple[dict[str, Any], bool]:
-        """Add known particles, and analyse the movie again; see `Kind`."""
-        if not run.inject or found.interrupted:
-            return {}, False
-        try:
-            config = found.context.config
-            if ready.stretches.breaks:  # a stretch tells what the others would
-                config = within(config, ready.stretches.main)
-            recovered = inject_and_recover(ready.movie, config, ready.camera, found, run)
-        except KeyboardInterrupt:
-            return {}, True
-        finally:
-            run.clock.lap("injection")
-        return {"injection": recovered}, False
-
-
 class LandingSearch:
     """Searches for particles that land or leave between two windows."""
 
@@ -450,10 +402,10 @@ class LandingSearch:
 class StoredSteps:
     """Draws rows of a landing movie: the windows before and after each step."""
 
-    def __init__(self, ready: Prepared, table: pd.DataFrame, summary: Mapping[str, Any]) -> None:
-        self._ready, self._table, self._config = ready, table, ready.config
-        self._window = int(summary[Landing.heading]["window_frames"])
-        self._stretches = summary.get("left_out", {}).get("analysed") or ()
+    def __init__(self, ready: Prepared, result: StoredResult) -> None:
+        self._ready, self._table, self._config = ready, result.table, ready.config
+        self._window = int(result.summary[LANDING.heading]["window_frames"])
+        self._stretches = result.summary.get("left_out", {}).get("analysed") or ()
         self._span = fitted_frames(ready.steady, ready.config)
         self._field = make_context(ready.config, ready.shape, lines=ready.lines, sliding=True)
         self._opened = lru_cache(1)(self._open)
@@ -466,7 +418,7 @@ class StoredSteps:
         camera = self._ready.camera.part(tile.here)
         return reader_of(part, self._config, camera, self._span), self._field.on_tile(tile)
 
-    def draw(self, row: int) -> EventView:
+    def __call__(self, row: int) -> EventView:
         """Draw a row of the table."""
         table, config, window = self._table, self._config, self._window
         tile = self._tile_around(table.iloc[row])
@@ -530,3 +482,9 @@ def _step(neighbours: Neighbours, row: pd.Series[Any], corner: tuple[int, int]) 
         abs(mass), float(row["snr"]),
     )  # fmt: skip
     return neighbours.draw(-1 if mass < 0 else 1, at, start)
+
+
+LANDING = Kind(
+    "landing", find_landings, LandingSearch, StoredSteps, inject_and_recover,
+    event_figures=2,  # the page shows hundreds
+)  # fmt: skip

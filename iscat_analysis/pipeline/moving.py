@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cached_property, lru_cache
-from typing import Any
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 import pandas as pd
@@ -20,8 +18,14 @@ from iscat_analysis.fitting.field import add_signal
 from iscat_analysis.fitting.ranges import checked, fitted_frames
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Run
-from iscat_analysis.pipeline.before_after import Background, BeforeAfter, StoredEvents
-from iscat_analysis.pipeline.kinds import Kind, Look, Redraw, candidate_table, with_threshold
+from iscat_analysis.pipeline.before_after import (
+    BEFORE_AFTER,
+    Background,
+    StoredEvents,
+    find_before_after,
+)
+from iscat_analysis.pipeline.kinds import Kind, Look, candidate_table, with_threshold
+from iscat_analysis.pipeline.stored import StoredResult
 from iscat_analysis.records import EventView, FloatArray, Windows, silent
 from iscat_analysis.threads import threads
 from iscat_analysis.tracking.blocks import row_view
@@ -45,90 +49,39 @@ AROUND = 100
 _BACKGROUND_TURNS = 3  # of level and power of a background under particles that are known
 
 
-class FrameByFrame(BeforeAfter):
-    """Particles that move over a background that was recorded before, or is known."""
-
-    still = False
-
-    def fitted(
-        self, ready: Prepared, run: Run, ground: Background, pool: ThreadPoolExecutor
-    ) -> DetectionResult:
-        """Fit each frame by itself, and link the fits; see `BeforeAfter`."""
-        movie, camera, windows = ready.steady, ready.camera, ground.windows
-        found = track_frames(
-            ground.context, movie, camera, windows, ground.summary,
-            check=checked(movie, camera), pool=pool, progress=run.progress,
-            doubt=ground.doubt, report=run.report,
-        )  # fmt: skip
-        if not windows.n_before:
-            noise = _judge_beside_particles(ready, ground.context, windows, found.fits)
-            run.report(*noise.findings)
-        return found
+def track_in_frames(
+    ready: Prepared, run: Run, ground: Background, pool: ThreadPoolExecutor
+) -> DetectionResult:
+    """Fit each frame by itself over a recorded background, and link the fits."""
+    movie, camera, windows = ready.steady, ready.camera, ground.windows
+    found = track_frames(
+        ground.context, movie, camera, windows, ground.summary,
+        check=checked(movie, camera), pool=pool, progress=run.progress,
+        doubt=ground.doubt, report=run.report,
+    )  # fmt: skip
+    if not windows.n_before:
+        noise = _judge_beside_particles(ready, ground.context, windows, found.fits)
+        run.report(*noise.findings)
+    return found
 
 
-class MovingInDarkField(FrameByFrame):
-    """Particles that move, and add their light to a background that is learnt with them."""
-
-    keeps_parts = True
-
-    def find(self, ready: Prepared, run: Run) -> DetectionResult:
-        """Learn the background in turns; see `Kind`."""
-        return find_moving(ready, run)
-
-    def redraw(
-        self,
-        ready: Prepared,
-        table: pd.DataFrame,
-        tracks: pd.DataFrame | None,
-        summary: Mapping[str, Any],
-    ) -> Redraw:
-        """Draw rows over the light beside the particles; see `Kind`."""
-        del tracks, summary
-        return _StoredInDarkField(self, ready, table).draw
-
-
-class _StoredInDarkField(StoredEvents):
+class StoredInDarkField(StoredEvents):
     """Draws rows over a background that is learnt with the tracks."""
 
     def made_context(self) -> AnalysisContext:
         """Make the models; see `StoredEvents`."""
-        ready, frames = self._ready, self.after[1] - self.after[0]
+        ready, frames = self.ready, self.after[1] - self.after[0]
         return tracking_context(ready.config, ready.shape, frames, ready.lines)
 
     def sums(self, span: tuple[int, int]) -> Windows:
         """Sum some frames over the light beside the particles; see `StoredEvents`."""
-        ready = self._ready
+        ready = self.ready
         return add_frames(self._ground, ready.camera, ready.steady.read(*span), span[0])
 
     @cached_property
     def _ground(self) -> Windows:
         sums = super().sums(self.after)
         return replace(sums, before_e=beside_particles(self.context, sums, self.table))
-
-
-class Moving(Kind):
-    """Particles that move over a background that is learnt with them."""
-
-    heading = "blocks"
-
-    def find(self, ready: Prepared, run: Run) -> DetectionResult:
-        """Follow particles block by block; see `Kind`."""
-        return find_moving(ready, run)
-
-    def preview(self, ready: Prepared) -> MovingSearch:
-        """Search single frames; see `Kind`."""
-        return MovingSearch(ready)
-
-    def redraw(
-        self,
-        ready: Prepared,
-        table: pd.DataFrame,
-        tracks: pd.DataFrame | None,
-        summary: Mapping[str, Any],
-    ) -> Redraw:
-        """Draw particles in single frames, over the background of their block; see `Kind`."""
-        blocks = int(summary[self.heading]["number"])
-        return StoredTracks(ready, table, tracks, blocks).draw
 
 
 class MovingSearch:
@@ -190,10 +143,10 @@ class MovingSearch:
 class StoredTracks:
     """Draws particles in single frames, over the background of their block."""
 
-    def __init__(
-        self, ready: Prepared, table: pd.DataFrame, tracks: pd.DataFrame | None, blocks: int
-    ) -> None:
-        self._ready, self._table = ready, table
+    def __init__(self, ready: Prepared, result: StoredResult) -> None:
+        self.ready, self._table = ready, result.table
+        table, tracks = result.table, result.tracks
+        blocks = int(result.summary[MOVING.heading]["number"])
         first, last = fitted_frames(ready.steady, ready.config)
         frames = max(last - first, 1)
         self._context = tracking_context(ready.config, ready.shape, frames, ready.lines)
@@ -209,7 +162,7 @@ class StoredTracks:
         self, start: int, stop: int
     ) -> tuple[MovingField, BackgroundEstimate, Localizations, NDArray[np.int64]]:
         """Read a block, and fit its background under the particles."""
-        ready, context = self._ready, self._context
+        ready, context = self.ready, self._context
         movie, config, camera = ready.steady, ready.config, ready.camera
         inside = np.flatnonzero(self._known & self._table["frame"].between(start, stop - 1))
         part = self._table.iloc[inside]
@@ -236,7 +189,7 @@ class StoredTracks:
                 ground = BackgroundEstimate(level, found.power if follows else ground.power)
         return field, ground, rows, inside[order]
 
-    def draw(self, row: int) -> EventView:
+    def __call__(self, row: int) -> EventView:
         """Draw a row of the table."""
         frame = int(self._table["frame"].iloc[row])
         k = int(np.searchsorted(self._edges, frame, side="right")) - 1
@@ -267,3 +220,10 @@ def _judge_beside_particles(
         context, movie, camera, (first, last), (frame, particles[:, :2]), ~windows.masked, without
     )
     return noise.compared_with_fits(table["chi2_reduced"].to_numpy(float))
+
+
+FRAME_BY_FRAME = replace(BEFORE_AFTER, find=partial(find_before_after, fit=track_in_frames))
+MOVING_IN_DARK_FIELD = replace(
+    BEFORE_AFTER, find=find_moving, stored=StoredInDarkField, keeps_parts=True
+)
+MOVING = Kind("blocks", find_moving, MovingSearch, StoredTracks)

@@ -82,7 +82,7 @@ class Preview:
         self.config = self.prepared.over_all_stretches().config
         self.notes = tuple(notes)
         self.camera, self.steady = self.prepared.known, self.prepared.steady
-        self._search = kind_of(self.config).preview(self.prepared)
+        self._search = kind_of(self.config).search(self.prepared)
         self._lock = threading.Lock()  # a viewer may ask from several threads
 
     @property

@@ -265,7 +265,7 @@ def _camera_values(camera: LearnedCamera) -> list[Value]:
 def _search_preview(preview: Preview) -> dict[str, Any]:
     """Search some frames all over the movie."""
     (first, last), window = preview.frames, preview.window
-    apart = 1 if preview.config.fit.mode == "track" else window
+    apart = 1 if preview.config.fit.follows_tracks else window
     places = max(1, min(_PREVIEW_PLACES, (last - first) // (2 * apart)))
     at = np.linspace(first, last, places + 1)
     looks = [preview.look(int((a + b) / 2)) for a, b in pairwise(at)]
@@ -357,7 +357,7 @@ def preview_lines(setup: Setup) -> list[str]:
     """Describe in a few lines what the search found."""
     seen = setup.preview
     total, places = sum(seen["candidates"]), len(seen["frames"])
-    moving = setup.config.fit.mode == "track"
+    moving = setup.config.fit.follows_tracks
     where = count(places, "frame" if moving else "place")
     windows = "" if moving else f", with windows of {count(seen['window'], 'frame')}"
     strongest = f", the strongest at {seen['strongest_snr']:.1f}" if seen["strongest_snr"] else ""

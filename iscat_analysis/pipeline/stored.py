@@ -155,8 +155,7 @@ class StoredResult:
                     f"from {expected[:12]}…); give the one that was analysed"
                 )
             ready = calibrated(movie, self.config).over_all_stretches()
-            kind = kind_of(ready.config)
-            return movie, kind.redraw(ready, self.table, self.tracks, self.summary)
+            return movie, kind_of(ready.config).stored(ready, self)
         except BaseException:
             movie.close()
             raise

@@ -313,7 +313,7 @@ def _runs(flags: BoolArray) -> Iterator[slice]:
 def reader_of(movie: CountSource, config: Config, camera: Camera, span: tuple[int, int]) -> Reader:
     """Read frames of a landing movie."""
     dark_e = -math.inf
-    if config.optics.scheme != "darkfield" and span[0] < span[1]:
+    if config.optics.interferes and span[0] < span[1]:
         numbers = np.linspace(span[0], span[1] - 1, _LEVEL_FRAMES).astype(int).tolist()
         seen, theirs = sampled(movie, camera)
         some = np.concatenate([seen.read(k, k + 1) for k in numbers])

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,9 +30,9 @@ from iscat_analysis.landing.merging import FinishedChunk, MergedChunks
 from iscat_analysis.landing.steps import ChunkFitter
 from iscat_analysis.landing.tasks import TaskBuilder
 from iscat_analysis.movie import open_stack
-from iscat_analysis.pipeline import analyse, fit_stack
+from iscat_analysis.pipeline import analyse, fit_stack, landings
 from iscat_analysis.pipeline.finish import summary_of
-from iscat_analysis.pipeline.landings import Landing, inject_and_recover
+from iscat_analysis.pipeline.landings import inject_and_recover
 from iscat_analysis.records import EVENT_COLUMNS, FRAME_COLUMN, EventView
 from iscat_analysis.search import chunks as chunks_module
 from iscat_analysis.search import chunks as planning
@@ -106,6 +107,13 @@ STEPS = sorted(
     [(f, 1, x, y, m) for f, _, x, y, m in EVENTS]
     + [(leave, -1, x, y, m) for _, leave, x, y, m in EVENTS if leave]
 )
+
+
+def _ready(counts: np.ndarray, camera: Camera) -> Any:
+    """Give what an injection has to know of a movie."""
+    return SimpleNamespace(
+        movie=Memory(counts), camera=camera, stretches=SimpleNamespace(breaks=())
+    )
 
 
 def _assert_all_found(table: pd.DataFrame, *, frames: int = 1, sigmas: float = 4.5) -> None:
@@ -353,9 +361,7 @@ def test_what_was_injected_is_looked_for_in_the_polarity_that_is_reported(
     config = _config("detection.polarity=dark")
     camera = Camera(gain_e_per_adu=4.0)
     result, _ = _run(counts, config)
-    found = inject_and_recover(
-        Memory(counts), config, camera, result, Run(inject=3)
-    )  # fmt: skip
+    found = inject_and_recover(_ready(counts, camera), Run(inject=3), result)
     assert found["added"] == 3
     assert found["recovered"] >= 2
 
@@ -370,9 +376,7 @@ def test_pulls_of_injected_particles_are_in_units_of_the_errors_that_are_reporte
     for kind in ("curvature", "measured"):
         config = _config(f"fit.sigma={kind}")
         result, _ = _run(counts, config, camera=camera)
-        found = inject_and_recover(
-            Memory(counts), config, camera, result, Run(inject=8)
-        )  # fmt: skip
+        found = inject_and_recover(_ready(counts, camera), Run(inject=8), result)
         pulls.append(found["pull_std"])
     assert pulls[0] > 1.1 * pulls[1]
 
@@ -592,7 +596,7 @@ def test_an_interrupted_run_resumes_to_the_same_result(
 ) -> None:
     config = _config("posterior.enabled=false", "background.window_frames=20", "compute.workers=1")
     monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.0031)
-    monkeypatch.setattr(Landing, "event_figures", 0)
+    monkeypatch.setattr(landings, "LANDING", replace(landings.LANDING, event_figures=0))
     fit_stack(movie, config, out=tmp_path / "whole.iscat")
     assert not partial_folder(tmp_path / "whole.iscat").exists()
     real: Callable[..., Any] = chunk_work.analyse_chunk
@@ -777,7 +781,7 @@ def test_an_interrupted_injection_keeps_what_the_movie_gave(
     movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = _config("posterior.enabled=false")
-    monkeypatch.setattr(Landing, "event_figures", 0)
+    monkeypatch.setattr(landings, "LANDING", replace(landings.LANDING, event_figures=0))
     calls = _interrupted_at_the_second_chunk(monkeypatch)
     out = tmp_path / "cut.iscat"
     with pytest.raises(KeyboardInterrupt):
