@@ -31,7 +31,6 @@ from iscat_analysis.search.templates import LARGEST_IMAGE, Templates, make_templ
 SPREAD_NM = 10_000.0
 """Farther than this from a particle its rings are left out; they are 1e-4 of its peak."""
 
-_WIDE_KEPT = 12  # models that reach far at hand, of 7 MB each
 
 _VARIANCE_OF_BACKGROUND = {
     "fixed": MEAN, "sliding": MEAN, "tracks": MEAN, "median": MEDIAN, "known": KNOWN,
@@ -175,7 +174,8 @@ def make_context(
         local = (
             LocalModels(config, model, field_px),
             LocalModels(config, beside, field_px),
-            LocalModels(config, wide, field_px, kept=_WIDE_KEPT),
+            # models that reach far at hand, of 7 MB each
+            LocalModels(config, wide, field_px, kept=12),
         )
     return AnalysisContext(
         config=config,

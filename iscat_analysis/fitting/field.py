@@ -52,12 +52,6 @@ MAX_ROUNDS = 8
 """Rounds of search; each takes the particles found so far off the image."""
 
 _SWEEPS = 2  # fits of everything with everything else in place, after the last round; at least
-_MOST_SWEEPS = 16  # two fits that share the light of one particle converge slowly
-# Share of the χ² in excess that a particle explains which is tried among others
-_LEAST_EXPLAINED_SHARE = 0.1
-_LEAST_SNR_CHANGE = 0.1  # change of signal-to-noise ratios from one sweep to the next
-_AS_FOUND = 0.95  # of the threshold: a fit whose final SNR is below it is explained by the others
-_DUPLICATE_PX = 1.5  # two fits nearer than this describe one particle
 
 
 def fit_field(
@@ -96,7 +90,8 @@ def fit_field(
             )
             events, windows = _settled(context, windows, events, pool)
             _, doubtful = search_field(context, windows, events, excess_noise)
-    least = _AS_FOUND * context.templates.threshold
+    # of the threshold: a fit whose final SNR is below it is explained by the others
+    least = 0.95 * context.templates.threshold
     kept = [e for e in events if e.snr > least and _wanted(context, e)]
     while 0 < len(kept) < len(events):  # a dropped fit no longer belongs to the others' background
         events = _fit_all(context, windows, [e.candidate for e in kept], kept, pool)
@@ -155,7 +150,8 @@ def _settled(
     context: AnalysisContext, windows: Windows, events: list[Fitted], pool: ThreadPoolExecutor
 ) -> tuple[list[Fitted], Windows]:
     """Fit all particles in turns, until fits near each other hardly change."""
-    for sweep in range(_MOST_SWEEPS if events else 0):
+    # two fits that share the light of one particle converge slowly
+    for sweep in range(16 if events else 0):
         last = _without_doubles(events, context)
         events = _fit_all(context, windows, [e.candidate for e in last], last, pool)
         windows = _refined(context, windows, events)
@@ -182,7 +178,12 @@ def _with_concealed(
         if not any(Status.POOR_FIT in event.fit.flags for event in trial):
             break
         fresh, _ = search_field(
-            context, power, trial, excess_noise, explains=_LEAST_EXPLAINED_SHARE
+            # Share of the χ² in excess that a particle explains which is tried among others
+            context,
+            power,
+            trial,
+            excess_noise,
+            explains=0.1,
         )
         if not fresh:
             break
@@ -417,7 +418,8 @@ def _is_settled(before: Sequence[Fitted], after: Sequence[Fitted], near_px: floa
     places = np.array([(e.candidate.x_px, e.candidate.y_px) for e in after])
     apart = np.hypot(*(places[:, None] - places).T) + 2 * near_px * np.eye(len(places))
     moved = np.array([a.snr - b.snr for a, b in zip(before, after, strict=True)])
-    return bool(np.all((np.abs(moved) < _LEAST_SNR_CHANGE) | (apart.min(axis=0) > near_px)))
+    # change of signal-to-noise ratios from one sweep to the next
+    return bool(np.all((np.abs(moved) < 0.1) | (apart.min(axis=0) > near_px)))
 
 
 def _without_doubles(events: Sequence[Fitted], context: AnalysisContext) -> list[Fitted]:
@@ -428,7 +430,8 @@ def _without_doubles(events: Sequence[Fitted], context: AnalysisContext) -> list
         if all(
             math.hypot(here.x_px - k.candidate.x_px, here.y_px - k.candidate.y_px)
             * context.pixel_nm
-            > min(_DUPLICATE_PX * context.pixel_nm, 150.0)
+            # two fits nearer than this describe one particle
+            > min(1.5 * context.pixel_nm, 150.0)
             for k in kept
         ):
             kept.append(event)

@@ -44,8 +44,6 @@ SPAN = 2
 SLOPE_SPAN = 6
 """Windows before a step, and as many after it, within which pixels may change along a line."""
 
-_LEAST_EXCESS = 2.5  # variance of slopes over that of noise; rings of what lands make it 2
-_MEDIAN_SQUARE = 0.4549  # of a standard normal variable
 _LOOKED_AT = 5  # turns at which slopes are compared with noise
 _MARGIN_PX = 8  # around a region, so that its own edges do not matter
 _REACH = SPAN * STRIDES
@@ -268,8 +266,10 @@ class MovingPattern:
                 continue
             slope = mover.image(np.tensordot(weights, spectra, 1))[used]
             noise = counts[used] / max(self._block_light.sum(), 1e-300) / information
-            found.append((float(np.median(slope**2 / noise)) / _MEDIAN_SQUARE, information))
-        if not found or np.median([excess for excess, _ in found]) < _LEAST_EXCESS:
+            # of a standard normal variable
+            found.append((float(np.median(slope**2 / noise)) / 0.4549, information))
+        # variance of slopes over that of noise; rings of what lands make it 2
+        if not found or np.median([excess for excess, _ in found]) < 2.5:
             return 0.0
         return float(np.median([(excess - 1) / information for excess, information in found]))
 

@@ -60,7 +60,6 @@ POSTERIORS = 20
 """Events whose posterior is sampled, where the configuration asks for it."""
 
 _FIELDS = 2  # chunks whose sums over the field are kept: one ends while the next begins
-_LARGEST_SHARE = 1.5  # times its share of the field, that a tile may have of the events shown
 
 
 @dataclass(frozen=True)
@@ -333,7 +332,8 @@ def _without_posteriors(views: Sequence[EventView]) -> tuple[EventView, ...]:
 
 def _shown_of(tile: Tile | None, left: int) -> int:
     """Give how many of the events that are still to be shown may be of a tile."""
-    share = 1.0 if tile is None else min(_LARGEST_SHARE * tile.share, 1.0)
+    # times its share of the field, that a tile may have of the events shown
+    share = 1.0 if tile is None else min(1.5 * tile.share, 1.0)
     return math.ceil(share * max(left, 0))
 
 

@@ -50,6 +50,7 @@ from iscat_analysis.fitting.run import Run
 from iscat_analysis.inference.heights import spread_of_heights
 from iscat_analysis.landing.chunks import ChunkNode, ChunkRunner, ChunkStore
 from iscat_analysis.landing.merging import MergedChunks
+from iscat_analysis.medians import robust_sigma
 from iscat_analysis.records import CountSource, FloatArray, Status, counted
 from iscat_analysis.search.sliding import boundaries, stride_of
 from iscat_analysis.threads import start_in_thread
@@ -63,12 +64,6 @@ LOST = 0.05
 
 LEAST_SHARE = 0.95
 """Share of field and time that is searched, below which it is said in words."""
-
-HEIGHT_FRAMES = 2000
-"""Frames from which heights are learned, at most."""
-
-LEAST_SD_NM = 0.1
-"""Least spread that is learned: with none the height would be held again."""
 
 
 def find_landings(ready: Prepared, run: Run) -> DetectionResult:
@@ -97,7 +92,8 @@ def with_learned_heights(ready: Prepared, run: Run) -> Config:
     if not particle.height_is_open or config.fit.heights_free:
         return config
     first, last = ready.stretches.main
-    trial = within(config, (first, min(last, first + HEIGHT_FRAMES)))
+    # Frames from which heights are learned, at most.
+    trial = within(config, (first, min(last, first + 2000)))
     found = analyse_landings(ready.movie, trial, ready.camera, Run(), lines=ready.lines)
     run.clock.lap("heights")
     good = (found.fits["status"] == Status.OK).to_numpy()
@@ -113,7 +109,8 @@ def with_learned_heights(ready: Prepared, run: Run) -> Config:
         run.report(COMMON_HEIGHT_UNKNOWN(values))
     learned = {
         "learned_height_nm": max(round(spread.mean_nm, 2), 0.0),
-        "height_sd_nm": min(max(round(spread.sd_nm, 2), LEAST_SD_NM), LARGEST_SD_NM),
+        # Least spread that is learned: with none the height would be held again.
+        "height_sd_nm": min(max(round(spread.sd_nm, 2), 0.1), LARGEST_SD_NM),
     }
     return config.model_copy(update={"particle": particle.model_copy(update=learned)})
 
@@ -257,7 +254,7 @@ def frame_findings(
         yield FRAMES_LEFT_OUT(values, where=name)
     known = np.flatnonzero(np.isfinite(light))
     change = light[known][1:] / light[known][:-1] - 1
-    usual = 1.4826 * float(np.median(np.abs(change))) if change.size else 0.0
+    usual = robust_sigma(change) if change.size else 0.0
     jumps = known[1:][np.abs(change) > max(JUMP, 8 * usual)] + first
     if jumps.size:
         largest = 100 * float(change[np.argmax(np.abs(change))])

@@ -129,9 +129,6 @@ def _missing(some: Sequence[Step], others: Sequence[Step]) -> list[Step]:
     return [step for step in some if id(step) not in there]
 
 
-_RESIDUE_SHARE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
-
-
 @dataclass(frozen=True)
 class SidelobeFilter:
     """Separates steps from side lobes of other steps."""
@@ -190,7 +187,8 @@ class SidelobeFilter:
         on_top = distance < self.roi_px / 6
         if on_top and abs(step.at.frame - peak.frame) > self.stride:
             return False
-        share = _RESIDUE_SHARE if on_top else 0.0 if step.is_measured else RINGS
+        # of a fitted step, below which a peak on top of it is what its fit left over
+        share = 0.15 if on_top else 0.0 if step.is_measured else RINGS
         return distance < 1.5 * self.roi_px and abs(peak.snr) < share * abs(step.start.snr)
 
     def _left_over(

@@ -39,9 +39,7 @@ from iscat_analysis.search.frames import Chunk
 from iscat_analysis.search.peaks import RINGS, chi2_excess, summits
 from iscat_analysis.search.sliding import STRIDES
 
-_KNOT_PX = 0.6  # between knots; rings are half a wavelength apart, some two pixels
 _OUTLIER_SIGMAS = 3.0  # standard deviations from which a pixel counts less
-_FITS = 4  # of the rings, with the outliers of the one before
 _PASSES = 2  # over steps whose pictures overlap
 _LITTLE, _MUCH = 0.1, 4.0  # χ² in excess over what the fit explains
 _LEAST_MISFIT_SHARE = 0.1  # share of a misfit that alone passes the threshold where it hides others
@@ -243,7 +241,8 @@ def ring_average(
     from scipy import sparse
     from scipy.sparse.linalg import spsolve
 
-    radius = np.hypot(y[:, None], x[None, :]).ravel() / _KNOT_PX
+    # between knots; rings are half a wavelength apart, some two pixels
+    radius = np.hypot(y[:, None], x[None, :]).ravel() / 0.6
     angle = np.arctan2(y[:, None], x[None, :] + 0 * y[:, None]).ravel()
     waves = [np.ones(angle.size)]
     for order in (1, 2):
@@ -266,7 +265,8 @@ def ring_average(
     ridge = sparse.identity(number * knots) * (1e-6 * float(np.mean(accuracy**2)))
     kept = accuracy**2
     image = np.zeros(value.size)
-    for _ in range(_FITS):
+    # of the rings, with the outliers of the one before
+    for _ in range(4):
         normal = design.T @ sparse.diags(kept) @ design + ridge
         image = design @ spsolve(normal.tocsc(), design.T @ (kept * value))
         off = np.abs(value - image) * accuracy

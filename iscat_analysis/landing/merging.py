@@ -32,7 +32,6 @@ VIEWS = 1000
 CLIPS = 250
 """Events of which a clip is kept, the first; the page holds fewer."""
 
-_DRIFT_PX = 512  # of the middle of the field, whose drift is measured
 
 SEAM_PX = 2.0
 """Estimates of one step by two chunks, or two tiles, are nearer than this."""
@@ -305,7 +304,8 @@ class MergedChunks:
         last = [done for done in self._done[:-1] if self._closes(done)] + self._done[-1:]
         if last[-1].ends_e.size == 0:  # it was interrupted in the middle of a stretch
             return None
-        middle = middle_of(first[0].ends_e.shape, _DRIFT_PX)
+        # of the middle of the field, whose drift is measured
+        middle = middle_of(first[0].ends_e.shape, 512)
         moved = [
             measure_drift(*(part[middle].astype(np.float64) for part in (a.ends_e[0], b.ends_e[1])))
             for a, b in zip(first, last, strict=True)

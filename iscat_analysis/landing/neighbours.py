@@ -42,12 +42,8 @@ from iscat_analysis.search.sliding import MapArray
 from iscat_analysis.search.templates import LARGEST_IMAGE
 
 _IMAGE_BYTES = 40_000_000  # of the images of steps that a chunk holds
-_FAINT_SNR = 30.0  # up to which the image of one region and its surroundings is enough
 WHOLE = (slice(None), slice(None))
 """All of an image."""
-
-_LEAST_CROSSED_SNR = 0.5  # contrast of a neighbour times the step's, below which fields do not meet
-_WEAK_CONTRAST = 0.05  # contrast up to which several add up
 
 
 _NUMBERS = count()
@@ -185,7 +181,8 @@ class Neighbours:
 
         Strong rings reach far, and fall as the square of the distance.
         """
-        strength = max(start.snr / _FAINT_SNR, 1.0)
+        # up to which the image of one region and its surroundings is enough
+        strength = max(start.snr / 30.0, 1.0)
         regions = min(strength, max(LARGEST_IMAGE, math.sqrt(strength * LARGEST_IMAGE)))
         return round(min(self.roi_px * regions, self._farthest_px))
 
@@ -317,7 +314,8 @@ class Neighbours:
         shared = self.shared(other, region)
         if shared is None:
             return False
-        return bool(np.abs(other.image[shared[1]]).max() * step.start.snr > _LEAST_CROSSED_SNR)
+        # contrast of a neighbour times the step's, below which fields do not meet
+        return bool(np.abs(other.image[shared[1]]).max() * step.start.snr > 0.5)
 
     def _field(self, step: Step, region: Region) -> ComplexArray:
         """Field of a step's particle over the reference, (1 or 2, y, x)."""
@@ -347,7 +345,8 @@ class Neighbours:
 
         A weak one has the same image, its own, at all times.
         """
-        strong = abs(step.start.mass_kda * self._contrast_per_kda) > _WEAK_CONTRAST
+        # contrast up to which several add up
+        strong = abs(step.start.mass_kda * self._contrast_per_kda) > 0.05
         if strong or step.is_measured or self.pattern is not None:
             return self.factor(step, before, after) - 1, 1.0
         return step.image, self.presence(step, after) - self.presence(step, before)

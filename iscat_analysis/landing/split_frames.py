@@ -37,10 +37,7 @@ PLACES, MOVIE_PLACES = 20_000, 100_000
 MOST_WINDOWS, FEWEST_WINDOWS = 8, 2
 """Windows of a chunk that are looked at."""
 
-TILE_SIDE_PX = 256
-"""Side of the middle of a tile at which its noise is looked at."""
 
-_LEAST_LIGHT_E = 1e4  # of a frame, whose power is then known to 1 %
 _BLOCK_BYTES = 16 * 2**20
 
 
@@ -143,7 +140,8 @@ def step_controls(
     times = [t for t in times if chunk.first <= t - window and t + window <= chunk.stop]
     if not times:
         return None
-    box = EVERYWHERE if own == EVERYWHERE else middle_of_box(own, chunk.shape, TILE_SIDE_PX)
+    # Side of the middle of a tile at which its noise is looked at.
+    box = EVERYWHERE if own == EVERYWHERE else middle_of_box(own, chunk.shape, 256)
     field = empty_field(
         context, chunk.mean_e[box], chunk.camera.read_variance_e2(chunk.shape)[box],
         chunk.usable[box], [event.fit for event in events], level=True,
@@ -228,7 +226,8 @@ def field_repeats(
     spans = (windows.frames_before, windows.frames_after)
     n_before = windows.n_before
     power = windows.power
-    if windows.before_e.sum() < _LEAST_LIGHT_E * max(n_before, 1):
+    # of a frame, whose power is then known to 1 %
+    if windows.before_e.sum() < 1e4 * max(n_before, 1):
         power = np.ones_like(power)  # too dark to tell one frame's from the next's
     powers = (power[:n_before], power[n_before:])
     # the level of the light is the one that the fits use

@@ -56,7 +56,6 @@ _SWEEPS = 10  # fits of what has neighbours that still move, with everything els
 # Of the threshold; a fit that reaches less is what other steps explain
 _LEAST_THRESHOLD_SHARE = 0.7
 _SAME_PX = 1.5
-_CORE_MARGIN_PX = 4.0  # beyond the core of a tile, from which a last fit may lead into it
 _LEAST_MASS_RATIO = 5.0  # times the mass of a step that another has, of whose light it may be
 
 
@@ -165,7 +164,8 @@ class ChunkFitter:
             for i, s in enumerate(everything)
             if keep[0] <= s.at.frame < keep[1] and sign * s.sign >= 0
         ]
-        own = [i for i in now if self._is_near_core(everything[i], _CORE_MARGIN_PX)]
+        # beyond the core of a tile, from which a last fit may lead into it
+        own = [i for i in now if self._is_near_core(everything[i], 4.0)]
         order = _by_place(everything, own)
         finished = self.mapper(
             lambda i: self._finish(i, everything, seen, around, lobe=i >= len(steps)), order

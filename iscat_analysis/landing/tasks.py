@@ -31,8 +31,6 @@ FEWEST_FRAMES = 10
 TRACE_FRAMES = 400
 """Frames with a particle that tell how steady its light is, unless three windows are more."""
 
-_TRACE_WINDOWS = 3
-_LEAST_FRAME_SNR = 2.0  # signal-to-noise ratio of a frame below which no more than a window tells
 _LEAST_MASS_RATIO = 3.0  # of a particle over a step that may be a change of its light
 
 
@@ -180,9 +178,10 @@ class TaskBuilder:
         }
         own = tuple(s for s in others if id(s) not in changes)
         without, there = windows.frames_before, windows.frames_after
-        if step.at.per_frame_snr < _LEAST_FRAME_SNR:
+        # signal-to-noise ratio of a frame below which no more than a window tells
+        if step.at.per_frame_snr < 2.0:
             return (without, there), own
-        reach = _TRACE_WINDOWS * self._window
+        reach = 3 * self._window
         reaches = (reach, max(reach, TRACE_FRAMES))[:: step.sign]
         low = max(step.at.frame - reaches[0], self._chunk.first)
         high = min(step.at.frame + reaches[1], self._chunk.stop)
@@ -235,7 +234,7 @@ class TaskBuilder:
         image = step.image[shared[1]].astype(np.float64)
         if image.shape != (region.rows[1] - region.rows[0], region.columns[1] - region.columns[0]):
             return None
-        known = self._added(step, neighbours, region, patch, pattern, image)
+        known = self.added(step, neighbours, region, patch, image, pattern)
         reach = self._search_reach
         search = (step.at.frame - reach, step.at.frame + reach + 1)
         return locate_step(
@@ -250,23 +249,12 @@ class TaskBuilder:
         region: Region,
         patch: Patch,
         image: FloatArray,
+        pattern: LocalPattern | None,
     ) -> FloatArray:
         """Height that neighbours, and the motion of the pattern, add to each frame.
 
         Shapes: `image` (ny, nx), result (t,).
         """
-        local = self._pattern.local(region, step.at.frame) if self._pattern else None
-        return self._added(step, neighbours, region, patch, local, image)
-
-    def _added(
-        self,
-        step: Step,
-        neighbours: Sequence[Step],
-        region: Region,
-        patch: Patch,
-        pattern: LocalPattern | None,
-        image: FloatArray,
-    ) -> FloatArray:
         known = np.zeros(len(patch.counts))
         frames = np.arange(patch.first, patch.first + known.size)
         seen, images = [], []
@@ -320,15 +308,6 @@ class TaskBuilder:
         return height
 
 
-TRACE_WINDOWS = 2
-"""Windows on either side of a step that its trace covers; a chunk holds as many around its core."""
-
-CLIP_NM = 1800.0
-"""Side of the square that a clip shows, at most [nm]."""
-
-CLIP_PIXELS = 25
-"""Pixels along it, at most; smaller ones are summed."""
-
 CLIP_STEPS = 6
 """Images of a clip from the first that reaches the step to the one at the step."""
 
@@ -336,7 +315,9 @@ CLIP_STEPS = 6
 def patch_of(fitted: StepEvent, neighbours: Neighbours) -> Patch:
     """Copy the frames around a step, for `trace_of` and `clip_of`."""
     region = fitted.event.region
-    turn, reach = fitted.step.at.frame, TRACE_WINDOWS * neighbours.window
+    # Windows on either side of a step that its trace covers; a chunk holds as many around its
+    # core.
+    turn, reach = fitted.step.at.frame, 2 * neighbours.window
     return neighbours.chunk.patch(turn - reach, turn + reach, region.rows, region.columns)
 
 
@@ -353,7 +334,9 @@ def trace_of(fitted: StepEvent, patch: Patch, tasks: TaskBuilder) -> Trace | Non
     mean = windows.before_e / light
     patch = replace(patch, mean_e=mean, usable=patch.usable & (mean > 0))
     heights, weight, scale = frame_heights(patch, image)
-    heights = heights - tasks.added(step, fitted.others, region, patch, image)
+    moving = neighbours.pattern
+    local = None if moving is None else moving.local(region, turn)
+    heights = heights - tasks.added(step, fitted.others, region, patch, image, local)
     frames = np.arange(patch.first, patch.first + heights.size)
     without = (frames >= windows.frames_before[0]) & (frames < windows.frames_before[1])
     level = np.average(heights[without], weights=weight[without])
@@ -378,8 +361,10 @@ def clip_of(fitted: StepEvent, patch: Patch, neighbours: Neighbours) -> Clip | N
     """Set windows that slide over a step against those before them."""
     context, chunk, pattern = neighbours.context, neighbours.chunk, neighbours.pattern
     window, turn, start = neighbours.window, fitted.step.at.frame, fitted.event.candidate
-    side = min(context.roi_px, 2 * math.ceil(CLIP_NM / context.pixel_nm / 2) - 1)
-    fold = math.ceil(side / CLIP_PIXELS)
+    # Side of the square that a clip shows, at most [nm].
+    side = min(context.roi_px, 2 * math.ceil(1800.0 / context.pixel_nm / 2) - 1)
+    # Pixels along it, at most; smaller ones are summed.
+    fold = math.ceil(side / 25)
     square, whole = region_around(side, chunk.shape, start), fitted.event.region
     sides = []
     for (low, high), (first, last) in ((square.rows, whole.rows), (square.columns, whole.columns)):

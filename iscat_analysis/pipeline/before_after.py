@@ -77,8 +77,6 @@ CHANGES = 4.0
 """Spread of the mass between parts of an event's frames over that of its light, beyond which it is
 no constant particle: with 4 degrees of freedom or more by chance once in 10¹²."""
 
-_LEAST_DEGREES = 4
-_LEAST_AWAY = 0.25  # of the field, from which what no particle explains is told
 _NEAR = 2.0  # λ/NA from a particle, within which a wrong model leaves most of it over
 
 
@@ -364,7 +362,8 @@ def _uneven_finding(
         mass = float(context.model.scale.mass(event.fit.theta[3]))
         add_signal(context, (x_nm, y_nm, z_nm, mass), field, signal)
         away &= np.hypot(x - x_nm, y - y_nm) > near_nm
-    if away.mean() < _LEAST_AWAY:
+    # of the field, from which what no particle explains is told
+    if away.mean() < 0.25:
         return uneven_warning(context.config, name, windows)
     if context.additive:
         signal = signal * photons_scale(context, windows)
@@ -381,7 +380,7 @@ def _flag_changing_masses(
     judged = list(events)
     for number, (event, own) in enumerate(zip(events, repeats, strict=True)):
         squares, degrees = own[0, column], own[0, -1]
-        if degrees >= _LEAST_DEGREES and squares > CHANGES**2 * degrees:
+        if degrees >= 4 and squares > CHANGES**2 * degrees:
             changing += 1
             judged[number] = replace(event, flags=verdict([*event.flags, Status.POOR_FIT])[1])
     return tuple(judged), changing

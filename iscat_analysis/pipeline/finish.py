@@ -88,8 +88,6 @@ _PLACES, _TOGETHER = 48, 6  # where some frames are looked at, and how many
 _FEWEST = 3  # of these that must have light
 _BINS = 40  # of time, in which events are counted
 _LIT = 0.1  # of the median pixel's light, which one that tells the noise has
-_PATTERN_PX = 256  # side of the part of a field whose pattern is followed
-_MOST_INTERVALS = 200
 _DROPPED = "dark, cut off, or the same as the frame before: left out"
 _HIDDEN = "partly hidden by bright or ill-described particles"
 
@@ -162,7 +160,8 @@ def look_at(movie: Stack, camera: Camera, start: int, stop: int) -> Seen:
     if used.any():
         steps = np.mean(np.diff(electrons, axis=0) ** 2, axis=0)
         noise = float(steps[used].sum() / (2 * expected[used].sum()))
-    middle = middle_of(movie.shape, _PATTERN_PX)
+    # side of the part of a field whose pattern is followed
+    middle = middle_of(movie.shape, 256)
     image = camera.part(middle).to_electrons(counts[good][..., *middle]) * steady
     return Seen(float(light[good].mean()), noise, image.mean(axis=0))
 
@@ -211,7 +210,7 @@ def _intervals(stretches: Stretches, found: DetectionResult) -> Iterator[dict[st
         edges = np.flatnonzero(np.diff(np.concatenate([[0], lost.astype(np.int8), [0]])))
         for start, stop in edges.reshape(-1, 2).tolist():
             number += 1
-            if number <= _MOST_INTERVALS:
+            if number <= 200:
                 yield {"start": first + start, "stop": first + stop, "what": _DROPPED}
 
 
@@ -236,8 +235,6 @@ def _numbers(values: Sequence[float] | NDArray[np.float64]) -> list[float | None
 _HEIGHTS = 65
 """Heights at which the Holevo bound is computed for a table; linear in between."""
 
-_CLEAR_OF_THRESHOLD = 3.0
-"""Standard deviations above the threshold from which hardly any sphere is missed."""
 
 _NO_SIZE = {
     TrackStatus.POOR_FITS,
@@ -351,7 +348,8 @@ def _sizes(context: AnalysisContext, table: pd.DataFrame) -> Sizes | None:
         good[name].to_numpy(float) for name in ("diameter_nm", "sigma_diameter_nm", "snr")
     )
     findings = []
-    near = diameter[snr < context.templates.threshold + _CLEAR_OF_THRESHOLD]
+    # Standard deviations above the threshold from which hardly any sphere is missed.
+    near = diameter[snr < context.templates.threshold + 3.0]
     if near.size:
         ends = {"least_nm": number(near.min()), "most_nm": number(near.max())}
         ends |= {"amount": count(near.size, "sphere"), "verb": "is" if near.size == 1 else "are"}

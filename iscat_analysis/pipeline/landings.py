@@ -67,11 +67,7 @@ from iscat_analysis.search.sliding import (
 from iscat_analysis.search.templates import LARGEST_IMAGE
 from iscat_analysis.threads import threads
 
-FEWEST_WINDOWS_PRESENT = 3
-"""Windows between landing and leaving."""
-
 _SAME_PX = 2.0
-_SAME_FRAMES = 4  # beside the stated interval of the frame
 
 
 @dataclass(frozen=True)
@@ -225,7 +221,8 @@ def draw_particles(
     if not good.size:
         good = np.array([context.model.material.mass_kda])
     margin = min(context.roi_px / 2, (min(field_px) - 1) / 2)
-    stay = FEWEST_WINDOWS_PRESENT * window
+    # Windows between landing and leaving.
+    stay = 3 * window
     first = frames[0] + window
     last = max(frames[1] - window - stay, first + 1)
     landings = np.sort(rng.integers(first, last, count))
@@ -273,7 +270,8 @@ def recovery(
             continue
         close = np.hypot(x - p.x_px, y - p.y_px)
         near = (close < _SAME_PX) & (mass * side > 0)
-        near &= np.abs(frame - when) <= error + _SAME_FRAMES
+        # beside the stated interval of the frame
+        near &= np.abs(frame - when) <= error + 4
         best = int(np.argmin(np.where(near, close, np.inf))) if near.any() else -1
         others = (close < separation_px) & (np.abs(frame - when) < 2 * window)
         if best >= 0:
@@ -321,9 +319,6 @@ def recovery(
     }
 
 
-_WINDOWS_KEPT = 16  # lengths of window whose models are remembered
-
-
 class LandingSearch:
     """Searches for particles that land or leave between two windows."""
 
@@ -335,7 +330,8 @@ class LandingSearch:
         opening = survey_over(ready.steady, config, ready.camera, self.frames, ready.opening)
         self._reader, noise, self.window = opening.reader, opening.noise, opening.window
 
-        @lru_cache(_WINDOWS_KEPT)
+        # lengths of window whose models are remembered
+        @lru_cache(16)
         def context(window: int) -> AnalysisContext:
             searches = sum(boundaries(stop - start, window) for start, stop in self._stretches)
             return make_context(

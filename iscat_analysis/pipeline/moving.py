@@ -46,8 +46,6 @@ from iscat_analysis.tracking.stages import blurred_rows
 AROUND = 100
 """Frames that make the background of one frame in which particles move."""
 
-_BACKGROUND_TURNS = 3  # of level and power of a background under particles that are known
-
 
 def track_in_frames(
     ready: Prepared, run: Run, ground: Background, pool: ThreadPoolExecutor
@@ -182,7 +180,8 @@ class StoredTracks:
             follows = config.background.power_normalization
             ground = initial_background(config, field)
             restore_particle_light(context, field, movie, camera, start, ground, rows)
-            for _ in range(_BACKGROUND_TURNS):
+            # of level and power of a background under particles that are known
+            for _ in range(3):
                 found = field.fit(ground, rows, sweeps=0)[1]
                 learnt = config.background.learnt_with_tracks
                 level = found.level if learnt else ground.level

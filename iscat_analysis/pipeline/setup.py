@@ -24,6 +24,7 @@ from iscat_analysis.diagnosis import as_moving, look_at_changes
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
 from iscat_analysis.instrument.learning import why_not
+from iscat_analysis.medians import robust_sigma
 from iscat_analysis.movie import Stack, open_stack, setup_beside
 from iscat_analysis.pipeline.preview import Preview
 from iscat_analysis.records import StackMetadata
@@ -36,10 +37,6 @@ READ, TO_GIVE = "read from the file", "to be given, by `iscat calibrate mass`"
 
 SAMPLES = ("protein", "gold", "silica", "polystyrene")
 """Kinds of samples: what the particles are made of."""
-
-_PREVIEW_PLACES = 5  # places in a movie at which the search looks
-_LIGHT_FRAMES = 16  # frames whose light is averaged
-_SIGMA_PER_MAD = 1.4826  # of normal numbers: standard deviation over median absolute deviation
 
 
 @dataclass(frozen=True)
@@ -266,13 +263,15 @@ def _search_preview(preview: Preview) -> dict[str, Any]:
     """Search some frames all over the movie."""
     (first, last), window = preview.frames, preview.window
     apart = 1 if preview.config.fit.follows_tracks else window
-    places = max(1, min(_PREVIEW_PLACES, (last - first) // (2 * apart)))
+    # places in a movie at which the search looks
+    places = max(1, min(5, (last - first) // (2 * apart)))
     at = np.linspace(first, last, places + 1)
     looks = [preview.look(int((a + b) / 2)) for a, b in pairwise(at)]
     found = [look.found() for look in looks]
     ready = preview.prepared
     start, stop = ready.span
-    lit = ready.steady.read(start, min(start + _LIGHT_FRAMES, stop))
+    # frames whose light is averaged
+    lit = ready.steady.read(start, min(start + 16, stop))
     strongest = max((float(table["snr"].abs().max()) for table in found if len(table)), default=0.0)
     return {
         "frames": [look.frame for look in looks],
@@ -291,9 +290,7 @@ def _spread(image: np.ndarray[Any, Any]) -> float:
     Shapes: `image` (y, x).
     """
     used = image[np.isfinite(image)]
-    return (
-        float(_SIGMA_PER_MAD * np.median(np.abs(used - np.median(used)))) if used.size else math.nan
-    )
+    return robust_sigma(used - np.median(used)) if used.size else math.nan
 
 
 def _toml_text(setup: Setup) -> str:

@@ -74,13 +74,8 @@ ALONE_NM = 3500.0
 LEAST_FRAMES = 8
 """Frames on either side without which a step is left out."""
 
-CONSTANT_P = 1e-3
-"""A step whose height changes before or after it, with less than this chance, is left out."""
 
-_SPOT = 1.0  # standard deviation of the spot over λ/NA
-_LEAST_SPOT = 2.0  # standard deviation of the spot, in squares whose energy is looked at
 _SHADOW_NM = 1500.0  # a weaker maximum nearer than this to a stronger one is part of it
-_OTHERS_NM = 1700.0  # side of the region around a neighbour
 _CORE_NM = 900.0  # radius that dates a step
 
 
@@ -140,14 +135,16 @@ def find_bright_steps(
 ) -> tuple[tuple[BrightStep, ...], Iterator[BrightStep]]:
     """Bright steps that stand alone, and all of them, brightest first, cut when asked for."""
     moved = None if motion is None else motion.contrast
-    spots = _spots(chunk, _SPOT * resolution_nm / pixel_nm, _SHADOW_NM / pixel_nm, moved, mapper)
+    # standard deviation of the spot over λ/NA
+    spots = _spots(chunk, 1.0 * resolution_nm / pixel_nm, _SHADOW_NM / pixel_nm, moved, mapper)
     # one after the other: between small kernels threads wait for each other at the interpreter
     cut = (
         _cut(chunk, spot, spots, window, pixel_nm, roi_px, ALONE_NM, motion)
         for spot in spots[: 4 * most]
     )
     alone = sorted(islice((step for step in cut if step), most), key=lambda step: -step.snr)
-    small = max(5, round(_OTHERS_NM / pixel_nm))
+    # side of the region around a neighbour
+    small = max(5, round(1700.0 / pixel_nm))
     every = (
         _cut(chunk, spot, spots, window, pixel_nm, small, _SHADOW_NM, motion) for spot in spots
     )
@@ -166,7 +163,8 @@ def _spots(
     power = np.add.reduceat(chunk.power, chunk.edges[:-1])
     frames = np.diff(chunk.edges)
     read = chunk.camera.read_variance_e2(chunk.shape)
-    side = max(1, int(spot_px / _LEAST_SPOT))
+    # standard deviation of the spot, in squares whose energy is looked at
+    side = max(1, int(spot_px / 2.0))
     cells = math.ceil(chunk.shape[0] / side), math.ceil(chunk.shape[1] / side)
     energy = np.zeros((count, *cells), dtype=np.float32)
     still = np.empty((0, 0), dtype=np.float32)
@@ -284,7 +282,9 @@ def _cut(
             patch = chunk.patch(low, high, rows, columns)
         if gap is None and step is not None:
             dated = locate_step(patch, _core(step, pixel_nm), (low + 1, high))
-            if dated.p_constant < CONSTANT_P:
+            # A step whose height changes before or after it, with less than this chance, is left
+            # out.
+            if dated.p_constant < (1e-3):
                 return None
             frame, gap = dated.frame, dated.gap
         if min(frame - (gap or 0) - low, high - frame - (gap or 0)) < LEAST_FRAMES:

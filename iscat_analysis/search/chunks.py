@@ -45,9 +45,6 @@ NOISE_FRAMES = 800
 
 _LEVEL_FRAMES = 24  # frames all over a movie, that tell how much light there is
 MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
-_AT_ONCE_BYTES = 2**26  # of frames that are looked at together where not all fit into memory
-_FEWEST_AT_ONCE = 8
-_BANDS = 4  # of rows, whose sums over the frames are made at a time
 _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is copied and looked at
 
 
@@ -165,7 +162,8 @@ class Reader:
         """Count the frames that are looked at together: all, where they fit into memory."""
         if frames * self.frame_bytes <= self._room_bytes:
             return max(frames, 1)
-        return max(_FEWEST_AT_ONCE, _AT_ONCE_BYTES // self.frame_bytes)
+        # of frames that are looked at together where not all fit into memory
+        return max(8, (2**26) // self.frame_bytes)
 
     def _frames(self, start: int, stop: int) -> NDArray[Any]:
         """Frames [start, stop) of those that are held, as one array."""
@@ -253,7 +251,8 @@ class Reader:
         good, light = self._lit(span, pool)
         counts = self._stored(*span)
         total, highest = np.zeros(self.shape), np.zeros(self.shape, dtype=self._movie.dtype)
-        bands = list(pairwise(np.linspace(0, self.shape[0], _BANDS + 1).astype(int).tolist()))
+        # of rows, whose sums over the frames are made at a time
+        bands = list(pairwise(np.linspace(0, self.shape[0], 4 + 1).astype(int).tolist()))
 
         def add(band: tuple[int, int], frames: NDArray[Any], lit: BoolArray) -> None:
             rows = slice(*band)
@@ -332,11 +331,8 @@ def counts_budget(config: Config) -> int:
 HALO = 2
 """Windows on either side of a chunk's core: a step, its neighbours, and theirs."""
 
-_FIRST_LONGER = 1.24  # than others, of a chunk that is summed before they are begun
 _SPAN_BYTES = 6e9  # of the frames of a chunk of a large field: they stay in the system's cache
-_CONTROLLED = 16  # tiles of a movie, or some more, tell enough of the noise where nothing lands
 _SUM_BYTES, _MAP_BYTES, _HIGHEST_BYTES = 4, 4, 2  # of a pixel of a block
-_TILE_SHARE = 0.63  # of what counts may take; the images and regions of its steps have the rest
 _TILE_BYTES = 160  # of a pixel of a tile, beside its blocks and maps
 
 
@@ -373,7 +369,8 @@ def plan_parts(
     count = math.ceil((last - first) / core)
     even = math.ceil((last - first) / count / stride) * stride
     halo = halo_frames(window)
-    every = max(1, count * len(tiles) // _CONTROLLED)
+    # tiles of a movie, or some more, tell enough of the noise where nothing lands
+    every = max(1, count * len(tiles) // 16)
     return [
         [
             Part(
@@ -410,7 +407,8 @@ def choose_tiles(
     side, halo, stride = halo_px(config), halo_frames(window), stride_of(window)
     smallest = _roi_px(config)
     per_block = _SUM_BYTES + _moving_bytes(config) + (0 if in_place else _MAP_BYTES)
-    budget, per_frame = _TILE_SHARE * counts_budget(config), per_block / stride
+    # of what counts may take; the images and regions of its steps have the rest
+    budget, per_frame = 0.63 * counts_budget(config), per_block / stride
     longest = int(_SPAN_BYTES // reader.frame_bytes)
     best: tuple[float, tuple[int, int], int] | None = None
     rows, columns = reader.shape
@@ -475,7 +473,8 @@ def plan_chunks(
     count = 2 * math.ceil((last - first) / core / 2)  # an even number
     even = (last - first) / count
     # two that are held at once have the room of two
-    longer = math.ceil(min(_FIRST_LONGER * even, 2 * core - even) / stride) * stride
+    # than others, of a chunk that is summed before they are begun
+    longer = math.ceil(min(1.24 * even, 2 * core - even) / stride) * stride
     rest = math.ceil((last - first - longer) / (count - 1) / stride) * stride
     edges = [first, *range(first + longer, last, rest), last]
     return [

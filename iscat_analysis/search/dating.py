@@ -165,8 +165,6 @@ def _gain_beyond(heights: FloatArray, weight: FloatArray, turn: int, gap: int) -
 CREDIBLE = 0.95
 """Posterior probability inside the interval of a step's frame."""
 
-_CLEAR_FRAME_SNR2 = 4.0  # (per-frame SNR)² at which about one frame around a step is doubtful
-
 
 @dataclass(frozen=True)
 class StepFrame:
@@ -221,7 +219,8 @@ def _half(rise: int) -> int:
 
 
 def _gap(per_frame_snr: float) -> int:
-    return round(_CLEAR_FRAME_SNR2 / max(per_frame_snr, 0.5) ** 2)
+    # (per-frame SNR)² at which about one frame around a step is doubtful
+    return round(4.0 / max(per_frame_snr, 0.5) ** 2)
 
 
 def locate_step(

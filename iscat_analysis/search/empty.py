@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from iscat_analysis.medians import SIGMA_PER_MAD
 from iscat_analysis.records import BoolArray, FloatArray
 
 CONTRASTS = ("whole", "parts", "eighths", "quarters", "halves")
@@ -29,7 +30,6 @@ FEWEST_PLACES = 60
 
 _TRIM_SIGMAS = 4.0  # robust standard deviations beyond which something else than noise is there
 _KEPT_VARIANCE = 0.998929  # of a normal law inside ±_TRIM standard deviations
-_NORMAL_QUARTILE = 0.6744897501960817
 _LEAST_LEFT = 0.5  # share of a variance; less is left only next to fits, where nothing is measured
 
 
@@ -184,7 +184,7 @@ class EmptyField:
         if left is not None:
             noise = noise * left[:, kept]
         whole = (means[1] - means[0]) / np.sqrt(noise)
-        scale = np.median(np.abs(whole), axis=1, keepdims=True) / _NORMAL_QUARTILE
+        scale = SIGMA_PER_MAD * np.median(np.abs(whole), axis=1, keepdims=True)
         quiet = np.all(np.abs(whole) < _TRIM_SIGMAS * scale, axis=0)
         if quiet.sum() < FEWEST_PLACES:
             return nothing

@@ -160,9 +160,6 @@ class FieldSums:
         )
 
 
-REGION_BYTES = 40_000_000
-"""Of the regions that a chunk or a tile holds."""
-
 _SPREAD = 2  # times the frames that are asked for, that lie between the first and the last
 _NO_COUNTS: NDArray[Any] = np.empty((0, 0, 0))
 
@@ -222,7 +219,8 @@ class HeldRegions:
     """The regions that were copied last: steps at one place ask for them in each of their fits."""
 
     def __init__(self) -> None:
-        self._held: LastUsed[tuple[int, NDArray[Any]]] = LastUsed(REGION_BYTES)
+        # Of the regions that a chunk or a tile holds.
+        self._held: LastUsed[tuple[int, NDArray[Any]]] = LastUsed(40_000_000)
 
     def frames(
         self,
@@ -275,13 +273,9 @@ HALF = 0.5
 DARK = 0.05
 """Share of the usual light, below which it is closed."""
 
-# Times the usual change from one frame to the next, that it takes at least
-_LEAST_CHANGE_RATIO = 8.0
 # Of the light of a frame's first and last rows, and of these over the middle one's
 _LEAST_EDGE_LIGHT = 0.1
-_EDGE_E = 400.0  # photoelectrons of a row, without which it tells nothing
 _COPIED = 256  # frames of a region that are copied together from a file
-_LIGHT_QUANTILE = 0.75  # quantile of the light of frames
 
 
 @dataclass(frozen=True)
@@ -488,7 +482,8 @@ def cut_off(counts: NDArray[Any], camera: Camera) -> BoolArray:
     )
     light = gain * (counts[:, ends].mean(axis=2, dtype=np.float64) - offset)
     usual = np.median(light, axis=0)
-    bright_enough = (usual > _LEAST_EDGE_LIGHT * usual[1]) & (usual * counts.shape[2] > _EDGE_E)
+    # photoelectrons of a row, without which it tells nothing
+    bright_enough = (usual > _LEAST_EDGE_LIGHT * usual[1]) & (usual * counts.shape[2] > 400.0)
     found: BoolArray = ((light < _LEAST_EDGE_LIGHT * usual) & bright_enough).any(axis=1)
     return found
 
@@ -501,9 +496,11 @@ def well_lit(light_e: FloatArray, least: float = HALF) -> BoolArray:
     lit: BoolArray = np.isfinite(light_e)
     if lit.any():
         known = light_e[lit]
-        usual = float(np.quantile(known, _LIGHT_QUANTILE))
+        # quantile of the light of frames
+        usual = float(np.quantile(known, 0.75))
         change = float(np.median(np.abs(np.diff(known)))) if known.size > 1 else 0.0
-        lit &= usual - light_e <= max((1 - least) * usual, _LEAST_CHANGE_RATIO * change)
+        # Times the usual change from one frame to the next, that it takes at least
+        lit &= usual - light_e <= max((1 - least) * usual, 8.0 * change)
     return lit
 
 
@@ -555,7 +552,10 @@ def make_chunk(
         (first, first + len(counts)), good, light_e, blocks.sum(axis=0, dtype=np.float64),
         highest.max(axis=0), camera, defects,
     )  # fmt: skip
-    return _chunk(stored, sums, camera, edges, blocks, check, _nothing, lends_blocks=False)
+    return Chunk(
+        first, stored, good, sums.power, camera, sums.mean_e, sums.usable, sums.saturated,
+        edges, blocks, check, _nothing, sums.level_e, lends_blocks=False,
+    )  # fmt: skip
 
 
 def sums_of(
@@ -622,24 +622,9 @@ def make_tile_chunk(
         counts, sums.good, camera, stride, check_and_let_go, mapper, highest=False
     )
     let_go()
-    return _chunk(counts, sums, camera, edges, blocks, check, let_go, lends_blocks=True)
-
-
-def _chunk(
-    counts: StoredFrames,
-    sums: FieldSums,
-    camera: Camera,
-    edges: NDArray[np.int64],
-    blocks: NDArray[np.float32],
-    check: Callable[[], None],
-    let_go: Callable[[], None],
-    *,
-    lends_blocks: bool,
-) -> Chunk:
-    """Put frames, their blocks and what is known of them together."""
     return Chunk(
         sums.span[0], counts, sums.good, sums.power, camera, sums.mean_e, sums.usable,
-        sums.saturated, edges, blocks, check, let_go, sums.level_e, lends_blocks,
+        sums.saturated, edges, blocks, check, let_go, sums.level_e, lends_blocks=True,
     )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.camera import Camera
+from iscat_analysis.medians import robust_sigma
 from iscat_analysis.records import FloatArray
 
 LONGEST_WINDOW = 100
@@ -25,13 +26,9 @@ SHORTEST_MOVIE = 4 * SHORTEST_WINDOW
 MOVIE_SHARE = 10
 """A window chosen from the noise takes at most this part of the movie."""
 
-SHOT_LIMITED = 1.2
-"""Noise variance over shot noise up to which averaging is called shot-noise limited."""
 
 _LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100)
 _SLOPE_DISTANCES_PX = (1, 2, 3, 4)  # pixels, whose differences make up the slope of a fine pattern
-_PARTICLE_SIGMAS = 4.0  # standard deviations, from which on a difference is not asked of motion
-_NORMAL_QUARTILE = 0.6744897501960817
 _PARTS = 4  # of a field, which a pattern that moves has in common
 _ROWS = 16  # on which the noise is measured
 _ROWS_TOGETHER = 64  # the same beside what the pattern's motion makes, of which slopes tell
@@ -49,7 +46,8 @@ class NoiseCurve:
         """Longest average that is shot-noise limited, and every shorter one too; 0 for none."""
         limit = 0
         for n, ratio in zip(self.frames, self.variance_over_shot, strict=True):
-            if ratio > SHOT_LIMITED * max(1.0, self.variance_over_shot[0]):
+            # Noise variance over shot noise up to which averaging is called shot-noise limited.
+            if ratio > 1.2 * max(1.0, self.variance_over_shot[0]):
                 break
             limit = n
         return limit
@@ -136,7 +134,7 @@ class _Strip:
         read = n * self.read
         sigma = np.sqrt((before + read) / before**2 + (after + read) / after**2)
         change = (contrast / sigma)[:, lit]
-        noise = _variance(change)
+        noise = robust_sigma(change) ** 2
         if not self.adjacent:
             return _Compared(noise, math.nan, math.nan)
         light = before + after
@@ -148,12 +146,13 @@ class _Strip:
             ]
         )
         seen = np.moveaxis(slopes[:, :, lit] / sigma[:, lit], 0, -1)  # (pair, pixel, slope)
-        usual = np.abs(change) < _PARTICLE_SIGMAS * math.sqrt(noise)
+        # standard deviations, from which on a difference is not asked of motion
+        usual = np.abs(change) < 4.0 * math.sqrt(noise)
         turned = np.swapaxes(seen * usual[..., None], 1, 2)
         moved = np.linalg.pinv(turned @ seen, hermitian=True) @ (turned @ change[..., None])
         motion = _shared_motion(change, seen, turned, np.nonzero(lit)[1])
         motion /= max(int(np.count_nonzero(usual)), 1)
-        return _Compared(noise, _variance(change - (seen @ moved)[..., 0]), motion)
+        return _Compared(noise, robust_sigma(change - (seen @ moved)[..., 0]) ** 2, motion)
 
 
 def _shared_motion(
@@ -185,10 +184,6 @@ def _across(images: FloatArray, reach: int, axis: int) -> FloatArray:
     at = np.arange(images.shape[axis])
     after, before = (images.take(np.clip(at + step, 0, at[-1]), axis) for step in (reach, -reach))
     return np.asarray(after - before)
-
-
-def _variance(values: FloatArray) -> float:
-    return (float(np.median(np.abs(values))) / _NORMAL_QUARTILE) ** 2
 
 
 def choose_window(curve: NoiseCurve, frames: int) -> int:

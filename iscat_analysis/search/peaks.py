@@ -28,7 +28,6 @@ from iscat_analysis.records import FloatArray
 SAMPLED = 0.85
 """Of a peak's height that the pixel next to it has at least."""
 
-_ORDER = 5  # of the spline: a parabola misses 1 % of the height of a peak between four pixels
 _REACH_PX = 6  # of the pixels that the spline goes through
 _FINE = np.linspace(-0.625, 0.625, 11)
 
@@ -95,7 +94,9 @@ def _spline() -> FloatArray:
     pixels = np.eye(2 * _REACH_PX + 1)
     places = [_REACH_PX + _FINE]
     return np.stack(
-        [map_coordinates(one, places, order=_ORDER, mode="mirror") for one in pixels], axis=1
+        # of the spline: a parabola misses 1 % of the height of a peak between four pixels
+        [map_coordinates(one, places, order=5, mode="mirror") for one in pixels],
+        axis=1,
     )
 
 
@@ -123,21 +124,12 @@ EXCEEDS = 1.5
 EXPLAINS = 0.5
 """Share of the χ² in excess that a particle inside the fitted region must explain."""
 
-DOMINANT_RATIO = 3.0
-"""Times the signal-to-noise ratio of an event from which on another one near it dwarfs it."""
-
-LISTED = 0.7
-"""Share of what a particle must have from which a candidate is listed, as a side lobe."""
 
 RINGS = 0.04
 """Share of a particle's signal-to-noise ratio that the model may leave over around it, where that
 is not measured."""
 
-_EXCESS_SIGMAS = 3.0  # of χ²'s own scatter, below which an excess may be noise
 _RING_PX = 2.0  # on either side of the candidate's distance
-_SECTOR_PX = 4.0  # of the ring, along it
-_RING_QUANTILE = 0.8  # share of the ring that is lower than what counts as its height
-_PATCH_PX = 5.0  # around the candidate, which is its own
 
 
 @dataclass(frozen=True)
@@ -160,14 +152,14 @@ class Described:
         """
         brightest = max(others, key=lambda other: other.snr, default=self)
         own = brightest.excess * (self.snr / brightest.snr) ** 2 if brightest.snr else 0.0
-        return brightest.snr > DOMINANT_RATIO * self.snr and self.snr**2 < EXPLAINS * (
-            self.excess - own
-        )
+        # Times the signal-to-noise ratio of an event from which on another one near it dwarfs it.
+        return brightest.snr > 3.0 * self.snr and self.snr**2 < EXPLAINS * (self.excess - own)
 
 
 def is_hidden(snr: float, size: float) -> bool:
     """Whether a candidate is too low to be listed, even as a side lobe."""
-    return abs(snr) <= LISTED * size
+    # Share of what a particle must have from which a candidate is listed, as a side lobe.
+    return abs(snr) <= 0.7 * size
 
 
 def chi2_excess(residuals: NDArray[Any]) -> float:
@@ -178,7 +170,8 @@ def chi2_excess(residuals: NDArray[Any]) -> float:
 
 def _significant(excess: float, n_pixels: int) -> float:
     """Excess of χ², 0 where it may be noise."""
-    return excess if excess > _EXCESS_SIGMAS * math.sqrt(2 * n_pixels) else 0.0
+    # of χ²'s own scatter, below which an excess may be noise
+    return excess if excess > 3.0 * math.sqrt(2 * n_pixels) else 0.0
 
 
 def size_on_ring(
@@ -199,11 +192,20 @@ def size_on_ring(
     reach = 2 * (distance + _RING_PX)  # farther away, others share no pixels with the ring
     known = np.asarray(others, dtype=np.float64).reshape(-1, 2)
     near = known[np.hypot(known[:, 0] - x0, known[:, 1] - y0) < reach]
-    highest = np.empty(max(8, round(2 * math.pi * distance / _SECTOR_PX)))
+    # of the ring, along it
+    highest = np.empty(max(8, round(2 * math.pi * distance / 4.0)))
     ring_heights(
-        snr, (float(x0), float(y0)), (float(xc), float(yc)), _RING_PX, _PATCH_PX, near, highest
+        # around the candidate, which is its own
+        snr,
+        (float(x0), float(y0)),
+        (float(xc), float(yc)),
+        _RING_PX,
+        5.0,
+        near,
+        highest,
     )
     seen = np.sort(highest[highest >= 0])
     if not seen.size:
         return 0.0
-    return float(np.interp(_RING_QUANTILE * (seen.size - 1), np.arange(seen.size), seen))
+    # share of the ring that is lower than what counts as its height
+    return float(np.interp(0.8 * (seen.size - 1), np.arange(seen.size), seen))

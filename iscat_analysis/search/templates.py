@@ -48,8 +48,6 @@ LARGEST_IMAGE = 3.5
 MOST_CANDIDATES = 1000
 """Candidates beyond which a search is given up where they are noise."""
 
-_NOISE_SHARE = 0.1  # of these that noise must account for; particles have a thousand times as many
-
 
 @dataclass(frozen=True)
 class ExcessNoise:
@@ -286,7 +284,8 @@ def refuse_flood(
     """
     if excess_noise is None or candidates <= MOST_CANDIDATES:
         return
-    if images * templates.reached_by(excess_noise.ratio) > _NOISE_SHARE * candidates:
+    # of these that noise must account for; particles have a thousand times as many
+    if images * templates.reached_by(excess_noise.ratio) > 0.1 * candidates:
         raise FloodError(
             f"{candidates} places{frames} pass the detection threshold: {excess_noise.message}"
         )
