@@ -28,7 +28,7 @@ from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.files import whole_file
-from iscat_analysis.findings import Finding, Findings, existing, remark
+from iscat_analysis.findings import Finding, Findings, existing
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.inference.fit import compile_kernels, parts_of
 from iscat_analysis.inference.heights import has_prior
@@ -276,10 +276,6 @@ class Run:
         for finding in existing(findings):
             self.findings.add(finding)
             self.notify(finding.text)
-
-    def warn(self, text: str) -> None:
-        """Report a sentence that has no code yet."""
-        self.report(remark(text))
 
     def warm_up(self, context: AnalysisContext) -> None:
         """Load or compile the kernels of fits."""
