@@ -9,13 +9,15 @@ takes ``**options``.  Each key says its default, what it means, and what the com
 
 import inspect
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict, TypeVar
 
 if TYPE_CHECKING:
     from iscat_analysis.calibration import Line
+    from iscat_analysis.config import Source
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -173,6 +175,65 @@ class BindingOptions(EventOptions, total=False):
     inactive: Annotated[
         bool,
         Option(False, "Fit the fraction of monomers, or of A, that does not bind.", "--inactive"),
+    ]
+
+
+class DayOptions(TypedDict, total=False):
+    """How the movies of a day are analysed, all at once or as they come."""
+
+    config: Annotated[
+        "Source | Sequence[Source] | None", Option(None, "As for `configure`; of all movies.")
+    ]
+    settings: Annotated[
+        Mapping[str, Any] | Iterable[str] | None,
+        Option(
+            None,
+            "As for `configure`; they win over `config`, the day's calibrations over both, and the "
+            "table over all.",
+        ),
+    ]
+    calibration: Annotated[
+        "Line | None",
+        Option(
+            None,
+            "The mass line of all movies, as ``iscat calibrate mass`` writes it; where there are "
+            "standards among the movies, it is refused.",
+        ),
+    ]
+    standards: Annotated[
+        str | Sequence[float] | None,
+        Option(
+            None,
+            "Masses in the calibrants [kDa], beside those of the table; as text with standard "
+            'errors, as in ``"66,146:1.5,480"``, otherwise 1 %.',
+        ),
+    ]
+    kd: Annotated[
+        Literal["dimer", "ab"] | None,
+        Option(
+            None,
+            "Fit an equilibrium constant to each condition with samples of several concentrations, "
+            "as `fit_kd`: of monomers in all in ``concentration_nm``, or of A and B in columns "
+            "``a_nm`` and ``b_nm``.",
+        ),
+    ]
+    kd_masses_kda: Annotated[
+        Sequence[float] | None,
+        Option(
+            None, "About the mass of the monomer, which is found otherwise, or of A and B [kDa]."
+        ),
+    ]
+    scheduler: Annotated[
+        str,
+        Option(
+            "threads",
+            'Where movies are analysed: ``"threads"``, here and one after the other, or the '
+            'address of a Dask scheduler, as ``"tcp://10.0.0.1:8786"``, on whose workers several '
+            "are at a time; the result is the same.",
+        ),
+    ]
+    scheduler_file: Annotated[
+        str | Path | None, Option(None, "File with that address, instead of `scheduler`.")
     ]
 
 

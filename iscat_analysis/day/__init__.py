@@ -7,16 +7,17 @@ finished, `gather` and `compare` make tables of all results, and ``report.batch`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import pandas as pd
 
-from iscat_analysis.calibration.line import Line, with_line
-from iscat_analysis.config import Source, configure
+from iscat_analysis.answers.output import Notify, tell
+from iscat_analysis.calibration.line import with_line
+from iscat_analysis.config import configure
 from iscat_analysis.day.calibrate import Day, calibrate_day
 from iscat_analysis.day.compare import Reaction, kd_name, reaction_of
 from iscat_analysis.day.gather import Found, read_movie
@@ -33,11 +34,11 @@ from iscat_analysis.day.table import (
     read_table,
 )
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.executors import THREADS, open_executor
+from iscat_analysis.executors import open_executor
 from iscat_analysis.inference.checks import path_in, shown
 from iscat_analysis.movie import files_of
+from iscat_analysis.options import DayOptions, takes
 from iscat_analysis.records import Progress, silent
-from iscat_analysis.species.equilibrium import Model
 from iscat_analysis.text import from_table
 from iscat_analysis.units import count
 
@@ -96,24 +97,18 @@ class Batch:
         }
 
 
+@takes(DayOptions)
 def batch(
     samples: str | Path | Table,
     *,
     out: str | Path,
-    config: Source | Sequence[Source] | None = None,
-    settings: Mapping[str, Any] | Iterable[str] | None = None,
-    calibration: Line | None = None,
-    standards: str | Sequence[float] | None = None,
-    kd: Model | None = None,
-    kd_masses_kda: Sequence[float] | None = None,
     only: tuple[int, int] | None = None,
     merge: bool = False,
     retry: bool = True,
-    scheduler: str = THREADS,
-    scheduler_file: str | Path | None = None,
     progress: Progress = silent,
-    notify: Callable[[str], None] | None = None,
+    notify: Notify | None = None,
     command: str = "",
+    **options: Unpack[DayOptions],
 ) -> Batch:
     """Analyse the movies of a day with its calibrations, and put them into one picture.
 
@@ -130,23 +125,6 @@ def batch(
         ``background.frames``, sets it for that movie, and any other is kept.
     out : str or Path
         Folder of the batch; it may hold an earlier one, which is brought up to date.
-    config : str, Path, mapping or Config, or a list of them, optional
-        As for `configure`; of all movies.
-    settings : mapping of str to Any, or iterable of str, optional
-        As for `configure`; they win over `config`, the day's calibrations over both, and the table
-        over all.
-    calibration : str, Path, Calibration or MassCalibration, optional
-        The mass line of all movies, as ``iscat calibrate mass`` writes it; where the batch has
-        standards of its own, it is refused.
-    standards : str or sequence of float, optional
-        Masses in the calibrants [kDa], beside those of the table; as text with standard errors, as
-        in ``"66,146:1.5,480"``, otherwise 1 %.
-    kd : {"dimer", "ab"}, optional
-        Fit an equilibrium constant to each condition with samples of several concentrations, as
-        `fit_kd`: of monomers in all in ``concentration_nm``, or of A and B in columns ``a_nm`` and
-        ``b_nm``.
-    kd_masses_kda : sequence of float, optional
-        About the mass of the monomer, which is found otherwise, or of A and B [kDa].
     only : (int, int), optional
         Analyse the K-th of N parts of the movies, and make no picture; several parts may be
         analysed at the same time, on machines that share the folder.
@@ -154,18 +132,13 @@ def batch(
         Make the picture of what is finished, or with `only` say what is, and analyse nothing.
     retry : bool
         Try again what failed, though nothing has changed.
-    scheduler : str
-        Where movies are analysed: ``"threads"``, here and one after the other, or the address of a
-        Dask scheduler, as ``"tcp://10.0.0.1:8786"``, on whose workers several are at a time; the
-        result is the same.
-    scheduler_file : str or Path, optional
-        File with that address, instead of `scheduler`.
     progress : Progress
         Called with the stage and the steps done and in all.
     notify : callable, optional
         Told in one line what was done.
     command : str
         The command line, for the reports.
+    **options
 
     Returns
     -------
@@ -191,13 +164,14 @@ def batch(
         raise ConfigError(
             f"`only` = {only[0]}/{only[1]}: write it as K/N, as in 1/4 for the first of four parts"
         )
-    reaction = reaction_of(kd, kd_masses_kda)
+    reaction = reaction_of(options["kd"], options["kd_masses_kda"])
+    standards, calibration = options["standards"], options["calibration"]
     table = samples if isinstance(samples, Table) else read_table(path_in("`samples`", samples))
     try:
         named = read_standards(standards) if standards is not None else ()
     except ValueError as error:
         raise ConfigError(f"`standards`: {error}") from None
-    common = configure(with_line(config, calibration), settings=settings)
+    common = configure(with_line(options["config"], calibration), settings=options["settings"])
     plan = make_plan(table, common, named)
     if calibration is not None and plan.standards:
         raise ConfigError(
@@ -205,16 +179,21 @@ def batch(
             "one of them out"
         )
     claim_folder(folder)
-    warn = notify or (lambda _: None)
     command_text = command or f"iscat_analysis.batch({str(table.source)!r}, out={str(out)!r})"
     outcomes: dict[str, Outcome] = {}
     try:
-        where = (THREADS, None) if merge else (scheduler, scheduler_file)
-        with open_executor(*where) as executor:
-            for warning in executor.warnings(plan.config.compute.memory_limit_mb):
-                warn(warning)
+        where = (options["scheduler"], options["scheduler_file"])
+        with open_executor(*(() if merge else where)) as executor:
+            tell(executor.warnings(plan.config.compute.memory_limit_mb), notify)
             runner = Runner(
-                folder, Records(folder), merge, progress, warn, command_text, executor, retry
+                folder,
+                Records(folder),
+                merge,
+                progress,
+                notify or _silent,
+                command_text,
+                executor,
+                retry,
             )
             day = calibrate_day(plan, runner)
             wanted = part_of(plan.movies, only)
@@ -229,7 +208,7 @@ def batch(
                     outcomes[name] = outcome
                     if outcome.ran:
                         which = f"{len(outcomes)} of {len(wanted)}: " if len(wanted) > 1 else ""
-                        warn(f"{which}{name}: {_short(outcome)}")
+                        tell([f"{which}{name}: {_short(outcome)}"], notify)
                     progress("movies", len(outcomes), len(wanted))
         outcomes = {movie.name: outcomes[movie.name] for movie in wanted}
     except KeyboardInterrupt:
@@ -251,6 +230,10 @@ def batch(
         movies = pd.DataFrame(rows, columns=["movie", "state", "why"])
         return Batch(folder, movies, pd.DataFrame(), pd.DataFrame(), ran, tuple(failed))
     return _gathered(plan, day, outcomes, reaction, runner, ran, tuple(failed))
+
+
+def _silent(_: str) -> None:
+    """Drop a message."""
 
 
 def _bytes_of(address: Path) -> int:

@@ -17,31 +17,30 @@ import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.calibration.line import Line, mass_line
-from iscat_analysis.config import Config, Source, configure
+from iscat_analysis.calibration.line import mass_line
+from iscat_analysis.config import Config, configure
 from iscat_analysis.day import Batch, batch
 from iscat_analysis.day.compare import reaction_of
 from iscat_analysis.day.jobs import Records, claim_folder
 from iscat_analysis.day.table import TABLES, Table, read_growing, read_standards
 from iscat_analysis.errors import ConfigError, DataError, IscatError, SchedulerError
-from iscat_analysis.executors import THREADS
 from iscat_analysis.fitting.run import is_resumable
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie import Stack, files_of, find_movies, is_open_to_write, open_stack
+from iscat_analysis.options import DayOptions, takes
 from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.reading import is_folder
 from iscat_analysis.records import Analysis, Progress, Status, silent
 from iscat_analysis.report.output import check_output
-from iscat_analysis.species.equilibrium import Model
 from iscat_analysis.units import count
 
 Notify = Callable[[str], None]
@@ -93,14 +92,26 @@ def watch_movie(
         notify(f"{path.name}: was written to meanwhile, and is watched again")
 
 
+class _Once:
+    """Says each thing once, to whoever listens."""
+
+    def __init__(self, notify: Notify | None) -> None:
+        self._notify, self._known = notify, set[str]()
+
+    def __call__(self, text: str, *, again: bool = False) -> None:
+        """Say a thing, unless it was said before."""
+        if self._notify is not None and (again or text not in self._known):
+            self._known.add(text)
+            self._notify(text)
+
+
 class _Growing:
     """A movie that grows."""
 
     def __init__(self, path: Path, config: Config, notify: Notify) -> None:
-        self._path, self._config, self._notify = path, config, notify
+        self._path, self._config, self._say = path, config, _Once(notify)
         self._state: object = None
         self._looks, self._analysed = 0, 0
-        self._said: set[str] = set()
 
     def rests(self) -> bool:
         """Look at the files, and tell whether they have not changed for some looks."""
@@ -138,13 +149,7 @@ class _Growing:
             self._say(f"not yet: {error}")
             return
         self._analysed = frames
-        self._notify(f"{count(frames, 'frame')}: {histogram(table)}")
-
-    def _say(self, text: str) -> None:
-        """Say a thing once."""
-        if text not in self._said:
-            self._said.add(text)
-            self._notify(text)
+        self._say(f"{count(frames, 'frame')}: {histogram(table)}", again=True)
 
 
 def histogram(table: pd.DataFrame) -> str:
@@ -172,23 +177,17 @@ State = tuple[tuple[str, int, int], ...]
 Ready = tuple[Table, tuple[State | None, ...]]
 
 
+@takes(DayOptions)
 def watch(
     folder: str | Path,
     *,
     out: str | Path | None = None,
-    config: Source | Sequence[Source] | None = None,
-    settings: Mapping[str, Any] | Iterable[str] | None = None,
-    calibration: Line | None = None,
-    standards: str | Sequence[float] | None = None,
-    kd: Model | None = None,
-    kd_masses_kda: Sequence[float] | None = None,
-    scheduler: str = THREADS,
-    scheduler_file: str | Path | None = None,
     interval_s: float = 10.0,
     stop: threading.Event | None = None,
     progress: Progress = silent,
     notify: Notify | None = None,
     command: str = "",
+    **options: Unpack[DayOptions],
 ) -> Batch | None:
     """Analyse the movies of a folder as they are saved, until it is interrupted.
 
@@ -202,10 +201,6 @@ def watch(
         are, as for `batch`, and may grow as well; movies that it does not name are samples.
     out : str or Path, optional
         Folder of the batch; default ``batch`` in `folder`.
-    config, settings, calibration, standards, kd, kd_masses_kda : optional
-        As for `batch`; `standards` are used once there is a calibrant.
-    scheduler, scheduler_file : optional
-        As for `batch`; one movie is analysed after another.
     interval_s : float
         Time between two looks at the folder [s].
     stop : threading.Event, optional
@@ -216,6 +211,7 @@ def watch(
         Told in one line what was done.
     command : str
         The command line, for the reports.
+    **options
 
     Returns
     -------
@@ -237,34 +233,36 @@ def watch(
     results = watched / FOLDER if out is None else path_in("`out`", out)
     if results.resolve() == watched.resolve():
         raise ConfigError(f"{results}: is where the movies are; choose another `out`")
+    standards, calibration = options["standards"], options["calibration"]
     try:
         read_standards(standards or ())
     except ValueError as error:
         raise ConfigError(f"`standards`: {error}") from None
-    reaction_of(kd, kd_masses_kda)
-    warn = notify or (lambda _: None)
+    reaction_of(options["kd"], options["kd_masses_kda"])
+    resolved: DayOptions = {
+        **options,
+        "config": configure(options["config"], settings=options["settings"]),
+        "settings": None,
+        "calibration": None if calibration is None else mass_line(calibration),
+    }
+    say = _Once(notify)
     analyse = partial(
         batch,
         out=results,
-        config=configure(config, settings=settings),
-        calibration=None if calibration is None else mass_line(calibration),
-        kd=kd,
-        kd_masses_kda=kd_masses_kda,
-        scheduler=scheduler,
-        scheduler_file=scheduler_file,
+        **resolved,
         retry=False,
         progress=_of_one_movie(progress),
-        notify=warn,
+        notify=notify,
         command=command or f"iscat_analysis.watch({str(folder)!r})",
     )
-    run, seen = _Run(analyse, standards, warn), WatchedFolder(watched, results, warn)
+    run, seen = _Run(analyse, standards, say), WatchedFolder(watched, results, say)
     ended = stop or threading.Event()
     done: Ready | None = None
     try:
         seen.check()
         claim_folder(results)
         Records(results).forget_failed()
-        warn(f"looks at {watched} every {interval_s:g} s; Ctrl-C ends it")
+        say(f"looks at {watched} every {interval_s:g} s; Ctrl-C ends it")
         while not ended.wait(interval_s):
             found = seen.check()
             if found is not None and found != done:
@@ -272,20 +270,20 @@ def watch(
                     run.bring_up_to_date(found[0], ended)
                     done = found
                 except (OSError, ConfigError, SchedulerError) as error:
-                    seen.warn(f"{error}; waiting until it is mended")
+                    say(f"{error}; waiting until it is mended")
     except KeyboardInterrupt:
-        warn("ending; the page is being completed")
+        say("ending; the page is being completed")
     return run.last_page(progress)
 
 
 def _of_one_movie(progress: Progress) -> Progress:
     """Leave out the stages that count movies, of which there is one at a time."""
 
-    def warn(stage: str, done: int, total: int) -> None:
+    def counted(stage: str, done: int, total: int) -> None:
         if stage not in ("movies", "gather"):
             progress(stage, done, total)
 
-    return warn
+    return counted
 
 
 @dataclass
@@ -306,11 +304,9 @@ class WatchedFolder:
     """A folder that is checked for new movies."""
 
     def __init__(self, folder: Path, out: Path, notify: Notify) -> None:
-        self._folder, self._out = folder, out
-        self._notify = notify
+        self._folder, self._out, self._say = folder, out, _Once(notify)
         self._files: dict[Path, _MovieFiles] = {}
         self._taken: set[Path] = set()
-        self._reported: set[str] = set()
         self._begun = False
 
     def check(self) -> Ready | None:
@@ -326,16 +322,16 @@ class WatchedFolder:
         try:
             table = read_growing(self._folder, find_movies(self._folder, but=own))
         except OSError as error:
-            self.warn(f"{self._folder}: cannot be read ({error.strerror}); waiting for it")
+            self._say(f"{self._folder}: cannot be read ({error.strerror}); waiting for it")
             return None
         except ConfigError as error:
             if not self._begun:
                 raise
-            self.warn(f"{error}; waiting until it is mended")
+            self._say(f"{error}; waiting until it is mended")
             return None
         self._begun = True
         for given in table.absent:
-            self.warn(f"{given}: is in the table, and waited for")
+            self._say(f"{given}: is in the table, and waited for")
         known = dict.fromkeys([*self._taken, *(row.path for row in table.rows)])
         files = {path: self._files_of(path) for path in known}
         ready = tuple(row for row in table.rows if files[row.path].settled)
@@ -352,17 +348,11 @@ class WatchedFolder:
             before.checks += 1
         else:
             if before is not None and before.state is not None and state is not None and not table:
-                self.warn(f"{path.name}: is being written, and waited for")
+                self._say(f"{path.name}: is being written, and waited for")
             self._files[path] = before = _MovieFiles(state)
         if before.checks == 1 and state is not None and not table:
             before.readable = _opens(path)
         return before
-
-    def warn(self, text: str) -> None:
-        """Warn once of the same thing."""
-        if text not in self._reported:
-            self._reported.add(text)
-            self._notify(text)
 
 
 def _state(address: Path) -> State | None:
@@ -387,9 +377,9 @@ class _Run:
     """Keeps a batch up to date, movie by movie, and makes its page from time to time."""
 
     def __init__(
-        self, analyse: Callable[..., Batch], standards: str | Sequence[float] | None, notify: Notify
+        self, analyse: Callable[..., Batch], standards: str | Sequence[float] | None, say: _Once
     ) -> None:
-        self._analyse, self._standards, self._notify = analyse, standards, notify
+        self._analyse, self._standards, self._say = analyse, standards, say
         self._table: Table | None = None
         self._reported: set[tuple[str, str]] = set()
         self._analysed: list[str] = []
@@ -415,7 +405,7 @@ class _Run:
         if waiting:
             counts = Counter(page.movies["state"])
             summary = ", ".join(f"{counts[name]} {name}" for name in sorted(counts))
-            self._notify(f"{summary}; the page is {page.page}")
+            self._say(f"{summary}; the page is {page.page}", again=True)
 
     def last_page(self, progress: Progress) -> Batch | None:
         """Make the page of everything that is finished."""
@@ -434,7 +424,7 @@ class _Run:
         for name, why in found.failed:
             if name not in missing and (name, why) not in self._reported:
                 self._reported.add((name, why))
-                self._notify(f"{name}: failed: {why}")
+                self._say(f"{name}: failed: {why}")
         ended = time.monotonic()
         return found, ended + (ended - begun) / _PAGES
 
