@@ -21,12 +21,12 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import choice_in, number_in
 from iscat_analysis.records import BoolArray, FloatArray, is_event
 from iscat_analysis.species.describe import Branch, poisson_interval, round_width
+from iscat_analysis.species.maximum import ENDS_95
 from iscat_analysis.species.tables import EventTable, event_table
 
 MOST_BARS = 2000
 """Bars of a histogram at most."""
 
-_ENDS = (0.025, 0.975)
 _REACH = 0.99  # quantile of the masses up to which is drawn
 _POINTS = 400
 _MOST_USUAL = 240  # bars of a histogram whose width nobody chose
@@ -160,8 +160,8 @@ def gate(masses_kda: FloatArray, low_kda: float, high_kda: float) -> Gate:
         mean_se=width / math.sqrt(k) if k > 1 else math.nan,
         width_kda=width,
         fraction=k / n if n else math.nan,
-        fraction_low=_share(k, n, _ENDS[0], k, n - k + 1) if n else math.nan,
-        fraction_high=_share(k, n, _ENDS[1], k + 1, n - k) if n else math.nan,
+        fraction_low=_share(k, n, ENDS_95[0], k, n - k + 1) if n else math.nan,
+        fraction_high=_share(k, n, ENDS_95[1], k + 1, n - k) if n else math.nan,
     )
 
 

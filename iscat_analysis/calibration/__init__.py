@@ -9,8 +9,8 @@ Peaks are fitted to events, not to bins: a normal distribution on a flat backgro
 likelihood inside the peak's own window.  The line through the peaks is that of York et al., Am. J.
 Phys. 72, 367 (2004).
 
-`calibrate` runs all steps: `peaks` finds the peaks, `matching` assigns them to standards, `line`
-fits the line, and `result` converts contrasts.  `standards` stores the optics of the measurement.
+`fit` finds the peaks, assigns them to standards and fits the line; `line` converts contrasts and
+stores the optics of the measurement.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """A laboratory's day: many movies, their calibrations, one picture.
 
-`table` reads what there is, `plan` names the results and resolves the configurations, `calibrate`
-makes the calibrations of the day, `run` does one job after another and leaves alone what is
-finished, `gather` and `compare` make tables of all results, and ``report.batch`` the page.
+`table` reads what there is, names the results and resolves the configurations, `calibrate` makes
+the calibrations of the day, `jobs` does one job after another and leaves alone what is finished,
+`gather`, `compare` and `publish` make tables and page of all results, and `watch` follows a folder
+or a movie that grows.
 """
 
 from __future__ import annotations

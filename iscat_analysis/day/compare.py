@@ -34,6 +34,7 @@ from iscat_analysis.findings import existing
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species import LEAST_EVENTS
 from iscat_analysis.species.equilibrium import Model
+from iscat_analysis.species.maximum import TWO_SIDED_95
 from iscat_analysis.species.tables import event_table
 
 SAME_MASS = 0.1
@@ -50,7 +51,6 @@ there is none, alone and among all that are compared (Holm), and the scatter τ 
 that the errors hold; NaN where there are no replicates."""
 
 _SIGMAS = 3.0  # standard errors within which two masses are the same
-_Z95 = 1.959964
 
 
 def match_species(species: pd.DataFrame) -> pd.DataFrame:
@@ -151,7 +151,7 @@ def sample_means(values: FloatArray, errors: FloatArray, sample: Sequence[int]) 
 def shifts(species: pd.DataFrame, reference: str) -> pd.DataFrame:
     """Compare every kind of species between the samples."""
     found: list[pd.DataFrame] = []
-    width = (species["share_high"] - species["share_low"]) / (2 * _Z95)
+    width = (species["share_high"] - species["share_low"]) / (2 * TWO_SIDED_95)
     species = species.assign(share_se=width)
     for kind, rows in species[species["kind"] > 0].groupby("kind", sort=True):
         names = list(dict.fromkeys(rows["sample"]))

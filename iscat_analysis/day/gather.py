@@ -16,7 +16,6 @@ import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-from scipy.special import gammaincinv
 
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.day.calibrate import Day
@@ -24,6 +23,8 @@ from iscat_analysis.day.jobs import Outcome
 from iscat_analysis.day.table import Movie, Plan
 from iscat_analysis.records import FloatArray, Status
 from iscat_analysis.report.answer import answer_in
+from iscat_analysis.species.describe import poisson_interval
+from iscat_analysis.species.maximum import TWO_SIDED_95
 from iscat_analysis.units import count
 
 LABELS = ("movie", "sample", "condition", "concentration_nm", "replicate", "role")
@@ -50,7 +51,6 @@ SPECIES_COLUMNS = (
 `share` is of the particles that came, as `fraction` is, but without outliers: one event far below
 the detection limit stands for any number of particles, and would take the others' fractions."""
 
-_Z95 = 1.959964
 _MASSES = ("mass_kda", "status", "p_value")
 
 
@@ -149,7 +149,8 @@ def shares_of(species: Sequence[Mapping[str, Any]]) -> list[dict[str, float]]:
     real = [s for s in species if not s["outlier"] and s["count_corrected"] is not None]
     came = {id(s): float(s["count_corrected"]) for s in real}
     relative = {
-        id(s): ((s["count_high"] or math.nan) - (s["count_low"] or 0.0)) / (2 * _Z95 * s["count"])
+        id(s): ((s["count_high"] or math.nan) - (s["count_low"] or 0.0))
+        / (2 * TWO_SIDED_95 * s["count"])
         for s in real
     }
     total, shares = sum(came.values()), []
@@ -160,7 +161,7 @@ def shares_of(species: Sequence[Mapping[str, Any]]) -> list[dict[str, float]]:
             shares.append({"share": a / total if a > 0 else math.nan})
             continue
         others = sum((came[k] * relative[k]) ** 2 for k in came if k != id(each))
-        error = _Z95 * math.hypot(relative[id(each)], math.sqrt(others) / b)
+        error = TWO_SIDED_95 * math.hypot(relative[id(each)], math.sqrt(others) / b)
         odds = math.log(a / b)
         low, high = (1 / (1 + math.exp(-odds - sign * error)) for sign in (-1, 1))
         shares.append({"share": a / total, "share_low": low, "share_high": high})
@@ -227,8 +228,8 @@ def poisson_rate(count: float | None, seconds: float) -> tuple[float, float, flo
     """Give a rate with its 95 % Poisson interval (Garwood, Biometrika 28, 437, 1936)."""
     if count is None or not (math.isfinite(count) and math.isfinite(seconds)):
         return math.nan, math.nan, math.nan
-    low = float(gammaincinv(count, 0.025)) if count > 0 else 0.0
-    return count / seconds, low / seconds, float(gammaincinv(count + 1, 0.975)) / seconds
+    low, high = poisson_interval(count)
+    return count / seconds, float(low) / seconds, float(high) / seconds
 
 
 def _typed(column: pd.Series[Any]) -> pd.Series[Any]:

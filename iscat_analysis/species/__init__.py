@@ -7,9 +7,9 @@ measured mass x_i and standard deviation σ_i comes from species k with
 
 so the width τ_k is what exceeds the measurement error: extreme deconvolution in one dimension
 (Bovy, Hogg & Roweis, Ann. Appl. Stat. 5, 1657, 2011).  Nothing is binned.  Widths have a weak prior
-(`widths`), and events of any mass a background that varies slowly (`background`).  That one mixture
+(`structure`), and events of any mass a background that varies slowly (`mixture`).  That one mixture
 serves species, ladders, comparisons and equilibria.  Where nobody asks for masses, species are
-peaks: components whose sum has one maximum are one (`search`).
+peaks: components whose sum has one maximum are one (`choices`).
 
 Light particles are missed.  The matched filter accepts a particle of mass m if its estimate
 y ~ N(m, σ_d²) exceeds u·σ_d, and the fit's x uses the same light at least as well, so that y is x
@@ -19,28 +19,25 @@ with further noise: given x, selection no longer depends on m.  The likelihood o
 
 s_i = max(σ_d, σ_i), and the weights w_k are those of the particles that came, seen or not.
 
-Where nobody says what is missed, the limit is a nuisance with a prior (`edges`).  The number of
+Where nobody says what is missed, the limit is a nuisance with a prior (`repeats`).  The number of
 components has the least BIC; a parametric bootstrap gives the intervals and says how often it would
 choose that number again.
 
-`describe` is the whole of it.  `events` says what is seen and what is missed, `mixture` holds the
-components and says which are one species, `structure` has the likelihood above where species or
-samples share parameters, `maximum` maximises every likelihood of masses, `search` tries numbers of
-components, `choices` are a number, given masses or a ladder, `bootstrap` repeats the measurement,
-and `curves` holds what is drawn.  `tables` reads events of any program.
+`describe` is the whole of it, curves included.  `events` says what is seen and what is missed,
+`mixture` holds the components and says which are one species, `structure` has the likelihood above
+where species or samples share parameters, `maximum` maximises every likelihood of masses and finds
+the ends of intervals, `choices` tries numbers of components, given masses or a ladder, and
+`repeats` the limits of detection and repeated measurements.  `tables` reads events of any program.
 
 `diameters` runs the same mixture on the logarithms of the diameters of spheres, whose errors depend
-on the diameter.
+on the diameter.  `comparison` asks whether two samples are one.  `equilibrium` fits a constant to a
+series of concentrations, with the law of mass action and the likelihood of `series`.
 
-`comparison` asks whether two samples are one.  `equilibrium` fits a constant to a series of
-concentrations, with the law of `mass_action` and the likelihood of `series`; `kinetics` has the
-rates of landing and leaving.
-
-A track tells a diffusion coefficient: `displacements` has the likelihood of its steps, with errors
-and motion blur, `diffusion` the estimate and the size that follows, and `motion` asks whether the
-particle diffuses freely, or with an exponent (`fractional`).  `tracks` puts all that and the mass
-(`common_mass`) into one row per track, with the refractive index (`refraction`) of particles in a
-volume.  `common_change` asks whether the masses of all tracks change together.
+A track gives a diffusion coefficient: `diffusion` has the likelihood of its steps, with errors and
+motion blur, the estimate and the size that follows, and `motion` tests whether the particle
+diffuses freely.  `tracks` puts all of it and the mass of each track into one row, with the
+refractive index of particles in a volume, and tests whether the masses of all tracks change
+together.
 """
 
 from __future__ import annotations

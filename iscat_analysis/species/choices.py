@@ -9,8 +9,8 @@ reach, the rung with the fewest events goes as long as BIC falls.  Where no mono
 of free species over small numbers are tried.  The heaviest with a BIC within `_BIC_TIE` of the
 least is taken, for half of a monomer's mass explains as much as the monomer.
 
-Components have widths of their own under the prior of `widths`, or one for all, and stand on the
-background of `background`, which takes what is none of them.
+Components have widths of their own under the prior of `structure`, or one for all, and stand on the
+background of `mixture`, which takes what is none of them.
 
 Whether the masses are those of a ladder is asked by a likelihood ratio against the same species
 with every mean free: twice the gain is χ² with as many degrees of freedom as there are means more.

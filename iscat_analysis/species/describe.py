@@ -31,7 +31,7 @@ from iscat_analysis.findings.tables import (
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.species.choices import Choice, Chosen, Ladder, LadderFit, Searched, peaks
 from iscat_analysis.species.events import Efficiency, Events, possible
-from iscat_analysis.species.maximum import TWO_SIDED_95
+from iscat_analysis.species.maximum import ENDS_95, TWO_SIDED_95
 from iscat_analysis.species.mixture import Mixture
 from iscat_analysis.species.repeats import Possible, Repeat, bootstrap, ratio_of_doubt, with_edges
 from iscat_analysis.units import count
@@ -72,7 +72,6 @@ more than `MOST_DOUBT` of it, is not determined: the mass is where its events li
 interval, and what came of it is NaN, as is its fraction; those of the others are among the
 others."""
 
-_INTERVAL_ENDS = (0.025, 0.975)
 _UNBIASED: Literal["weibull"] = "weibull"  # of few draws other quantiles lie too far inside
 _MOST_RELATIVE_WIDTH = 0.4  # width over mass
 _SKEWED = 0.02  # of the mass: how far from it a mean is told
@@ -173,7 +172,7 @@ def describe(
     """Describe a set of masses as a mixture of species.
 
     Without `limit_known` nobody knows what is detected, and `efficiency` says nothing: intervals
-    hold that doubt (`edges`).
+    hold that doubt (`repeats`).
 
     Notes
     -----
@@ -317,7 +316,7 @@ def interval_of(values: Sequence[FloatArray], species: int) -> tuple[FloatArray,
     if not values:
         nothing = np.full(species, math.nan)
         return nothing, nothing
-    low, high = np.quantile(np.array(values), _INTERVAL_ENDS, axis=0, method=_UNBIASED)
+    low, high = np.quantile(np.array(values), ENDS_95, axis=0, method=_UNBIASED)
     return low, high
 
 
@@ -462,8 +461,7 @@ HISTOGRAM_COLUMNS = ("low_kda", "high_kda", "count", "count_low", "count_high")
 CURVE_COLUMNS = ("mass_kda", "density", "density_se", "model", "model_corrected", "efficiency")
 """Columns of `Distribution.curves`."""
 
-NOISES = np.linspace(0.05, 0.95, 10)
-"""Quantiles that stand for the events' own noise."""
+_NOISES = np.linspace(0.05, 0.95, 10)  # quantiles that stand for the errors of all events
 
 _POINTS = 300
 _MOST_BINS = 240
@@ -478,8 +476,8 @@ def bandwidth_of(events: Events, species: int) -> float:
 def poisson_interval(counts: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Give 95 % intervals of counts (Garwood, Biometrika 28, 437, 1936)."""
     n = np.asarray(counts)
-    low = np.where(n > 0, gammaincinv(np.maximum(n, 1), 0.025), 0.0)
-    return low, np.asarray(gammaincinv(n + 1, 0.975))
+    low = np.where(n > 0, gammaincinv(np.where(n > 0, n, 1), ENDS_95[0]), 0.0)
+    return low, np.asarray(gammaincinv(n + 1, ENDS_95[1]))
 
 
 def round_width(wanted: float) -> float:
@@ -496,16 +494,24 @@ def histogram_of(events: Events) -> pd.DataFrame:
     return pd.DataFrame(dict(zip(HISTOGRAM_COLUMNS, columns, strict=True)))
 
 
+def mean_density(events: Events, best: Mixture, x: FloatArray) -> FloatArray:
+    """Give the density of a mixture, averaged over the errors of events.
+
+    Shapes: `x` (m,), result (m,).
+    """
+    parts = [
+        np.exp(logsumexp(best.log_terms(Events(x, np.full(x.shape, sigma), None)), axis=1))
+        for sigma in np.quantile(events.sigma, _NOISES)
+    ]
+    return np.asarray(np.mean(parts, axis=0))
+
+
 def curves_of(events: Events, best: Mixture, bandwidth: float) -> pd.DataFrame:
     """Give densities per kDa: kernel with its Poisson error, model as seen and as it came."""
     mass = np.linspace(0.0, _reach(events), _POINTS)
     z = (mass[:, np.newaxis] - events.x) / bandwidth
     kernel = np.exp(-0.5 * z**2) / (math.sqrt(2 * math.pi) * bandwidth)
-    pieces = [
-        np.exp(logsumexp(best.log_terms(Events(mass, np.full(mass.shape, sigma), None)), axis=1))
-        for sigma in np.quantile(events.sigma, NOISES)
-    ]
-    arrived = best.arrived(events) * np.mean(pieces, axis=0)
+    arrived = best.arrived(events) * mean_density(events, best, mass)
     return pd.DataFrame(
         {
             "mass_kda": mass,
@@ -539,6 +545,6 @@ def _selected(events: Events, x: FloatArray) -> FloatArray:
     """Probability that an event of measured mass x was detected, averaged over its noise."""
     if events.efficiency is None:
         return np.ones(x.shape)
-    extra = events.efficiency.extra_sigma(np.quantile(events.sigma, NOISES))
+    extra = events.efficiency.extra_sigma(np.quantile(events.sigma, _NOISES))
     at = x[:, np.newaxis] - np.maximum(events.efficiency.threshold_kda, 0.0)
     return np.asarray(ndtr(at / np.maximum(extra, 1e-9)).mean(axis=1))

@@ -31,7 +31,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.special import logsumexp
 
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.tables import LARGE_DIAMETER_ERRORS, SPHERES_LEFT_OUT
@@ -40,9 +39,9 @@ from iscat_analysis.species.choices import Searched
 from iscat_analysis.species.describe import (
     LEAST_EVENTS,
     LEAST_SPECIES,
-    NOISES,
     histogram_of,
     interval_of,
+    mean_density,
     selection_of,
     widening,
 )
@@ -225,11 +224,7 @@ def _curve(events: Events, best: Mixture) -> pd.DataFrame:
         math.exp(events.x.min() - reach), math.exp(events.x.max() + reach), _POINTS
     )
     x = np.log(diameter)
-    pieces = [
-        np.exp(logsumexp(best.log_terms(Events(x, np.full(x.shape, sigma), None)), axis=1))
-        for sigma in np.quantile(events.sigma, NOISES)
-    ]
-    density = events.x.size * np.mean(pieces, axis=0) / diameter
+    density = events.x.size * mean_density(events, best, x) / diameter
     return pd.DataFrame({"diameter_nm": UNIT_NM * diameter, "model": density / UNIT_NM})
 
 

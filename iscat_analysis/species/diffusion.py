@@ -209,7 +209,7 @@ def gather(
     )
 
 
-_NM2_PER_UM2 = 1e6  # nm²
+NM2_PER_UM2 = 1e6  # nm²
 
 
 @dataclass(frozen=True)
@@ -323,15 +323,15 @@ def fit_diffusion(
     other, other_sigma = covariance_based(track, best)
     spare = other_sigma**2 - crb**2
     return Diffusion(
-        d_um2_s=best / _NM2_PER_UM2,
-        sigma_d_um2_s=sigma / _NM2_PER_UM2,
-        crb_d_um2_s=crb / _NM2_PER_UM2,
-        interval_um2_s=tuple(end / _NM2_PER_UM2 for end in _interval(track, best, level)),  # type: ignore[arg-type]
+        d_um2_s=best / NM2_PER_UM2,
+        sigma_d_um2_s=sigma / NM2_PER_UM2,
+        crb_d_um2_s=crb / NM2_PER_UM2,
+        interval_um2_s=tuple(end / NM2_PER_UM2 for end in _interval(track, best, level)),  # type: ignore[arg-type]
         level=float(level),
         log_likelihood=log_likelihood,
         n_positions=track.counted.size + 1,
-        covariance_d_um2_s=other / _NM2_PER_UM2,
-        covariance_sigma_d_um2_s=other_sigma / _NM2_PER_UM2,
+        covariance_d_um2_s=other / NM2_PER_UM2,
+        covariance_sigma_d_um2_s=other_sigma / NM2_PER_UM2,
         disagreement=(other - best) / math.sqrt(spare) if spare > 0 else math.nan,
     )
 
@@ -351,7 +351,7 @@ def estimate_diffusion(
         frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms, counted=counted,
     )  # fmt: skip
     best, sigma, *_ = _estimated(track)
-    return best / _NM2_PER_UM2, sigma / _NM2_PER_UM2
+    return best / NM2_PER_UM2, sigma / NM2_PER_UM2
 
 
 def _estimated(track: Displacements) -> tuple[float, float, float, float]:

@@ -22,7 +22,7 @@ Table s holds events of the species at equilibrium, with weights among the parti
 
     w_sk ∝ c_k(totals_s; K_D, β) · m_k^p
 
-(`mass_action`).  What the tables' peaks, backgrounds and detectors look like is learned with them
+as above.  What the tables' peaks, backgrounds and detectors look like is learned with them
 (`series`), and the product of the likelihoods of all tables is maximised in ln K_D, all of that,
 the exponent p unless it is given, and, where asked for, β.  Only ratios of species count: how many
 events a table has depends on the surface as well and says nothing here.

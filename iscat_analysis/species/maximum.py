@@ -155,6 +155,9 @@ def _positive(curvature: FloatArray, scale: FloatArray) -> FloatArray:
     return np.asarray((vectors * np.maximum(np.abs(values), least)) @ vectors.T / unit)
 
 
+ENDS_95 = (0.025, 0.975)
+"""Quantiles at the ends of a 95 % interval."""
+
 TWO_SIDED_95 = 1.959964
 """Standard errors from an estimate to an end of its 95 % interval."""
 

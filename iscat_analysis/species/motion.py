@@ -32,9 +32,8 @@ from iscat_analysis._kernels.harmonic_trap import most_likely_well
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in, shown
 from iscat_analysis.records import FloatArray
-from iscat_analysis.species.diffusion import Displacements, gather, most_likely
+from iscat_analysis.species.diffusion import NM2_PER_UM2, Displacements, gather, most_likely
 
-_NM2_PER_UM2 = 1e6  # nm²
 STRETCH = 40
 """Displacements at least of a stretch of a track whose D is compared with that of the others."""
 
@@ -157,7 +156,7 @@ def anomalous_test(
         ratio=ratio,
         exponent=found.exponent,
         sigma_exponent=found.sigma_exponent,
-        d_um2_s=found.d_nm2_s / _NM2_PER_UM2,
+        d_um2_s=found.d_nm2_s / NM2_PER_UM2,
     )
 
 
@@ -235,7 +234,7 @@ def confinement_test(
             p_value = larger / number
             break
     size = math.sqrt(d / stiffness) if ratio > 0 else math.inf
-    return ConfinementTest(p_value, ratio, size, d / _NM2_PER_UM2)
+    return ConfinementTest(p_value, ratio, size, d / NM2_PER_UM2)
 
 
 def steadiness_test(

@@ -32,6 +32,7 @@ from iscat_analysis.species.choices import (
     split_starts,
 )
 from iscat_analysis.species.events import Edge, Events
+from iscat_analysis.species.maximum import ENDS_95
 from iscat_analysis.species.mixture import Mixture
 from iscat_analysis.species.structure import (
     Structure,
@@ -49,7 +50,6 @@ _HOPELESS = 12.0  # log-likelihood below the highest, beyond which a limit is no
 _FAR = 0.35  # prior: that T lies below all of these, where it makes no difference
 _LOWEST = 10  # events that tell how far below the lightest a cut may be
 _JUST_BELOW = 1e-9  # of the lightest event
-_ENDS = (0.025, 0.975)
 _BETTER = 0.1  # of BIC: other species, and not the same found again
 _LEAST = 1e-3  # probability of a limit that is kept
 
@@ -148,7 +148,7 @@ def ratio_of_doubt(possible: list[Possible]) -> FloatArray:
     ):
         for number, column in enumerate(values.T):
             order = np.argsort(column)
-            ends = np.searchsorted(np.cumsum(weight[order]), _ENDS)
+            ends = np.searchsorted(np.cumsum(weight[order]), ENDS_95)
             low, high = column[order][np.minimum(ends, column.size - 1)]
             ratios[number] = min(ratios[number], high / max(low, 1e-300))
     return ratios

@@ -6,7 +6,7 @@ them, have in common:
 - Species of mass Σ n_p m_p + b.  The offset b is an error of the mass scale, of `_OFFSET` of the
   lightest species (a prior, as all widths that follow).
 - Peaks with an exponential tail t, of either sign, as a few normal components (`_segments`), and
-  widths of their own under the prior of `widths`: a complex may well be twice as wide as a monomer.
+  widths of their own under the usual prior: a complex may well be twice as wide as a monomer.
 - A background whose density is learned: broad normal components at the middles of the gaps between
   species, so that it bends nowhere under a peak, and of the same shape in every table.  That shape
   is smooth: its logarithm is nearly a line.  Shares scatter about a level that the series has.

@@ -8,7 +8,7 @@ a sample are linear in a few parameters θ,
 with Σ w_k = 1 and the usual error σ of the events.  A free mixture has a parameter for each; a
 ladder has μ_k = n_k m₁ + b; two samples that share masses have the same columns for these and their
 own for the weights; the background has its share alone.  The likelihood is that of `mixture` and
-adds over samples, with the prior of `widths` in place of a fixed width; its slope is the slope of
+adds over samples, with the prior of widths in place of a fixed width; its slope is the slope of
 each sample times its design.
 
 How wide peaks are: a weak prior on widths that grow with a power of the mass.

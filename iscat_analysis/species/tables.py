@@ -7,8 +7,8 @@ Light particles are missed, and what tells how many depends on the table.
 - Given a limit M₅₀ and a spread: u σ_d = M₅₀, and σ_d is the spread.
 - Given a cut: events below it are left out, and the species are those of a distribution that is cut
   there, which is exact whatever was missed below.
-- Otherwise a limit is learned: from the peaks of the table (`edges`), or of all tables of a series
-  together (`series`).  Comparisons take the lightest event of each table for a cut.
+- Otherwise a limit is learned: from the peaks of the table (`repeats`), or of all tables of a
+  series together (`series`).  Comparisons take the lightest event of each table for a cut.
 
 Tables without errors of their own have σ = `UNKNOWN_SIGMA_KDA` for every event, less than any
 instrument's; the width of a species then holds its error.

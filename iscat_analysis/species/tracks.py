@@ -84,6 +84,7 @@ from iscat_analysis.records import (
 )
 from iscat_analysis.species.diffusion import (
     LEAST_POSITIONS,
+    NM2_PER_UM2,
     Diffusion,
     estimate_diffusion,
     fit_diffusion,
@@ -465,7 +466,6 @@ _OF_IMAGES = ("sigma_mass_kda", "sigma_optical_diameter_nm", "sigma_refractive_i
 _FREE = ("p_confinement", "p_anomalous", "p_steady")
 _STEPS = 3.0  # standard deviations of a displacement within which it may end beyond the border
 _DISPLACEMENT_PASSES = 3  # at D, on which it depends which displacements tell it
-_NM2_PER_UM2 = 1e6  # nm²
 
 
 @dataclass(frozen=True)
@@ -647,7 +647,7 @@ def _diffusion(placed: TrackRows, setup: TrackSetup) -> Diffusion | None:
     for _ in range(_DISPLACEMENT_PASSES):
         counted = inside
         d_um2_s, _ = estimate_diffusion(*positions, **times, counted=counted)
-        inside = room > _STEPS * np.sqrt(2 * d_um2_s * _NM2_PER_UM2 * gaps_s)
+        inside = room > _STEPS * np.sqrt(2 * d_um2_s * NM2_PER_UM2 * gaps_s)
         if inside.sum() < least - 1:
             return None
         if np.array_equal(inside, counted):
@@ -754,7 +754,7 @@ def _is_partly_seen(record: Mapping[str, Any], setup: TrackSetup) -> bool:
     frames = setup.frames[1] - setup.frames[0]
     if setup.frame_rate_hz is None or record["n_frames"] > _LEAST_SEEN_SHARE * frames:
         return False
-    way_nm = math.sqrt(2 * _NM2_PER_UM2 * abs(record["d_um2_s"]) * frames / setup.frame_rate_hz)
+    way_nm = math.sqrt(2 * NM2_PER_UM2 * abs(record["d_um2_s"]) * frames / setup.frame_rate_hz)
     return way_nm < setup.hidden_nm
 
 
@@ -762,7 +762,7 @@ def _ends(rows: TrackRows, setup: TrackSetup, d_um2_s: float) -> dict[str, str]:
     """Say whether the track begins and ends with the movie, at the border, or inside the field."""
     step_nm = 0.0
     if setup.frame_rate_hz is not None and np.isfinite(d_um2_s):
-        step_nm = 3 * float(np.sqrt(2 * d_um2_s * _NM2_PER_UM2 / setup.frame_rate_hz))
+        step_nm = 3 * float(np.sqrt(2 * d_um2_s * NM2_PER_UM2 / setup.frame_rate_hz))
     border, room = setup.near_nm + step_nm, _room(rows, setup)
     ends = {}
     for which, at, frame in (("begins", 0, setup.frames[0]), ("ends", -1, setup.frames[1] - 1)):

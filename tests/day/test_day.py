@@ -320,7 +320,7 @@ def test_the_line_on_an_equilibrium_has_its_remarks(finished: Path) -> None:
     assert "left out, with less than 10 events: b" in line
     line = _partly_told(finished, 0, 1)
     assert "1 movie; left out" in line
-    assert "a single table tests no model" in line
+    assert "a single table the model cannot be tested" in line
     assert "nan" not in line
 
 
