@@ -21,11 +21,11 @@ from iscat_analysis.instrument.particle_image import (
     PRIVATE,
     ROAM_NM,
     Build,
-    Microscope,
     ParticleImage,
     models_of,
     with_masses,
 )
+from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.parameters import MASK_NA, PARAMETERS, Prior, Settings
 from iscat_analysis.records import FloatArray, Mapper
 
@@ -363,7 +363,7 @@ def _solve(
 
 
 def _scores(
-    image: ParticleImage, model: Microscope, names: tuple[str, ...], private: FloatArray
+    image: ParticleImage, model: ForwardModel, names: tuple[str, ...], private: FloatArray
 ) -> tuple[float, FloatArray, FloatArray, FloatArray]:
     """Log-likelihood, score, expected information and its observed squares, shared ones first."""
     x, y, z, mass, level = (float(v) for v in private)
@@ -396,7 +396,7 @@ class Neighbours:
     """Particles with the rings that they make in one microscope."""
 
     particles: tuple[ParticleImage, ...]
-    wide: Microscope
+    wide: ForwardModel
 
     @classmethod
     def fitted(

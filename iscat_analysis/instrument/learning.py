@@ -190,10 +190,7 @@ def not_alone(
 
 
 def _centre(
-    image: ParticleImage,
-    model: ForwardModel,
-    build: Callable[[Settings], ForwardModel],
-    settings: Settings,
+    image: ParticleImage, model: ForwardModel, build: Build, settings: Settings
 ) -> tuple[float, float]:
     """Find the particle in a picture [nm], whose brightest spot may be of a ring.
 

@@ -10,7 +10,7 @@ What they do not tell keeps the width of the prior.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,7 +29,6 @@ from iscat_analysis.instrument.particle_image import (
     goodness,
     with_masses,
 )
-from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.parameters import (
     FREE,
     HIGHER,
@@ -466,10 +465,7 @@ class Measured:
 
 
 def judge(
-    images: Sequence[ParticleImage],
-    build: Callable[[Settings], ForwardModel],
-    settings: Settings,
-    mapper: Mapper = map,
+    images: Sequence[ParticleImage], build: Build, settings: Settings, mapper: Mapper = map
 ) -> Judgement:
     """Judge fitted pictures one by one and all together."""
     from scipy.stats import kstest  # a second to load, for those who learn optics
@@ -501,7 +497,7 @@ class OpticsSearch:
     """One measurement of the microscope from pictures of particles; its steps in order of `run`."""
 
     configured: Settings
-    build: Callable[[Settings], ForwardModel]
+    build: Build
     free: Sequence[str]
     """Groups of parameters."""
 

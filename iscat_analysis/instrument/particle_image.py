@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -31,32 +31,7 @@ ROAM_NM = 300.0
 """Farthest from the centre of a picture that its particle may be, along x and y."""
 
 
-class Microscope(Protocol):
-    """What the estimator asks of a forward model."""
-
-    def image(
-        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
-    ) -> FloatArray:
-        """Signal of one particle."""
-
-    def gradient(
-        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Signal, and its derivatives with respect to x, y, z and mass."""
-
-    def joint_gradient(
-        self,
-        grid: PixelGrid,
-        x_nm: float,
-        y_nm: float,
-        z_nm: float,
-        mass_kda: float,
-        names: Sequence[str],
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Signal, and its derivatives with respect to the particle and the named optics."""
-
-
-Build = Callable[[Settings], Microscope]
+Build = Callable[[Settings], ForwardModel]
 """Makes the microscope of some settings."""
 
 
@@ -158,9 +133,9 @@ class ParticleImage:
 
 def models_of(
     images: Sequence[ParticleImage], build: Build, settings: Settings
-) -> list[Microscope]:
+) -> list[ForwardModel]:
     """Give the microscope of every picture; those alike share one."""
-    models: dict[tuple[Any, ...], Microscope] = {}
+    models: dict[tuple[Any, ...], ForwardModel] = {}
     out = []
     for image in images:
         own = image.seen_with(settings)
@@ -403,7 +378,7 @@ def refuse_uncalibratable(config: Config) -> None:
         )
 
 
-def microscopes(config: Config, reach_nm: float) -> Callable[[Settings], ForwardModel]:
+def microscopes(config: Config, reach_nm: float) -> Build:
     """Make models of changing optics, and keep the last few."""
 
     def model(items: tuple[tuple[str, Any], ...]) -> ForwardModel:
@@ -413,7 +388,7 @@ def microscopes(config: Config, reach_nm: float) -> Callable[[Settings], Forward
     return lambda settings: at_hand(tuple(settings.items()))
 
 
-def rings_of(config: Config, image: ParticleImage) -> Callable[[Settings], ForwardModel]:
+def rings_of(config: Config, image: ParticleImage) -> Build:
     """Make models as far as rings of neighbours matter."""
     return microscopes(config, RINGS_NM + image.grid.diagonal_nm)
 

@@ -55,7 +55,12 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     "the reference's phase is tilted": ("phase_tilt_x_deg", "phase_tilt_y_deg"),
     "the reference's phase is curved": ("phase_curvature_deg",),
 }
-"""Coefficients that are asked for, tried and kept together, with what they mean."""
+"""Coefficients that are asked for, tried and kept together, with what they mean.
+
+Movies that need each: drift, bend and jumps in `tests/diagnosis/test_focus_drift.py`, the others,
+but for a tilted phase, in `tests/instrument/test_uneven_optics.py`; `benchmarks/hazards.py` has a
+row for a tilted focus.
+"""
 
 JUMP = "the focus jumps"
 """The same of one more jump, at the frame at which the pictures ask for it most."""

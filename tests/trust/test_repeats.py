@@ -37,7 +37,6 @@ from iscat_analysis.report.answer import headline, rejection, species_widths
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.search.empty import CONTRASTS, EmptyField
 from iscat_analysis.species.tables import event_table as events_of
-from iscat_analysis.species.tables import sentences
 from iscat_analysis.trust.checks import likely_noise, measured_scale, spread_verdict
 
 SIGMAS = 4.0
@@ -432,7 +431,7 @@ def test_species_of_poor_fits_are_judged_where_the_model_is_rejected(tmp_path: P
     table.to_csv(tmp_path / "fits.csv")
     listed = events_of(tmp_path / "fits.csv")  # as `iscat species` and `iscat kd` read it
     assert listed.mass_kda.size == 120
-    assert any("poor fits are counted too" in note for note in sentences(listed.notes))
+    assert any("poor fits are counted too" in finding.text for finding in listed.findings)
     assert one["width_low"] < 7.5 < one["width_high"]
     assert one["spread_over_sigma"] == pytest.approx(np.hypot(1, 7.5 / 2), rel=0.2)
     fair = table.assign(status="ok", flags="", p_value=rng.uniform(size=120))
