@@ -231,9 +231,11 @@ def _series(
     options: BindingOptions,
 ) -> tuple[pd.DataFrame, FloatArray, list[EventTable], list[Finding]]:
     """Read rows, concentrations and events of a series, and say what is left out."""
-    base = None if isinstance(samples, pd.DataFrame) else path_in("`samples`", samples)
-    rows = samples if base is None else from_table(read_frame(base))
-    assert isinstance(rows, pd.DataFrame)
+    if isinstance(samples, pd.DataFrame):
+        base, rows = None, samples
+    else:
+        base = path_in("`samples`", samples)
+        rows = from_table(read_frame(base))
     rows, kept = _used(rows, name)
     findings: list[Finding] = []
     of_batch = tables is None and "report" in rows

@@ -245,9 +245,8 @@ def picture(
     extent = (-half, half, half, -half)
     shown = axes.imshow(image, vmin=low, vmax=high, extent=extent, **{"cmap": "RdBu_r", **style})
     axes.set_title(title)
-    figure = axes.get_figure(root=True)
-    assert figure is not None
-    figure.colorbar(shown, ax=axes, shrink=0.8)
+    if (figure := axes.get_figure(root=True)) is not None:
+        figure.colorbar(shown, ax=axes, shrink=0.8)
 
 
 def display_range(images: Sequence[Any], scheme: str) -> tuple[float, float]:
