@@ -47,8 +47,8 @@ from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
+import scipy
 from numpy.typing import DTypeLike, NDArray
-from scipy.optimize import least_squares
 
 from iscat_analysis.camera.counts import Camera, converter_ceiling, float_type, full_scale_of
 from iscat_analysis.camera.transfer import SIGMAS, TOLERANCE, Transfer
@@ -218,7 +218,7 @@ def _fitted(found: Transfer, u: FloatArray, family: _Family, offset: FloatArray)
     low, high = family.ends
     ends = np.array([[low, *(-3.0 + 0 * offset)], [high, *(0.9 + 0 * offset)]])
     start = np.clip([family.start, *offset], *ends)
-    best = least_squares(residuals, start, bounds=ends, xtol=1e-10, x_scale="jac")
+    best = scipy.optimize.least_squares(residuals, start, bounds=ends, xtol=1e-10, x_scale="jac")
     theta, covariance = best.x, np.linalg.pinv(best.jac.T @ best.jac)
     value, se = float(theta[0]), math.sqrt(float(covariance[0, 0]))
     shift = float(theta[1]) if offset.size else 0.0
