@@ -33,6 +33,7 @@ from iscat_analysis.tracking.field import MovingField
 from iscat_analysis.tracking.find import beside_particles, find_moving, track_frames
 from iscat_analysis.tracking.frames import (
     LEAST_FRAMES,
+    Recording,
     exposure_of,
     initial_background,
     load_field,
@@ -96,7 +97,8 @@ class MovingSearch:
         @lru_cache(1)
         def background(span: tuple[int, int]) -> tuple[MovingField, BackgroundEstimate]:
             with threads(config.compute.workers) as pool:
-                field = load_field(self._context, movie, camera, span, check, pool, silent)
+                recording = Recording(movie, camera, check, pool, silent)
+                field = load_field(self._context, recording, span)
                 return field, initial_background(config, field)
 
         self._background = background
@@ -175,11 +177,12 @@ class StoredTracks:
         rows, variances = blurred_rows(rows, speeds, exposure_of(config)[1])
         with threads(config.compute.workers) as pool:
             check = checked(movie, camera)
-            field = load_field(context, movie, camera, (start, stop), check, pool, silent)
+            recording = Recording(movie, camera, check, pool, silent)
+            field = load_field(context, recording, (start, stop))
             field.set_blurs(variances)
             follows = config.background.power_normalization
             ground = initial_background(config, field)
-            restore_particle_light(context, field, movie, camera, start, ground, rows)
+            restore_particle_light(context, recording, start, field, ground, rows)
             # of level and power of a background under particles that are known
             for _ in range(3):
                 found = field.fit(ground, rows, sweeps=0)[1]

@@ -22,12 +22,10 @@ Where heights are fitted no two frames show the same: each is a picture of its o
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -47,9 +45,10 @@ from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.optics.model import blurred
 from iscat_analysis.optics.parameters import FAINTEST
-from iscat_analysis.records import BoolArray, CountSource, EventView, FloatArray, Progress, Windows
+from iscat_analysis.records import BoolArray, EventView, FloatArray, Windows
 from iscat_analysis.threads import start_in_thread
 from iscat_analysis.tracking.field import MovingField
+from iscat_analysis.tracking.frames import Recording
 from iscat_analysis.tracking.joint import variances_left
 from iscat_analysis.tracking.linking import (
     OUTLYING,
@@ -252,14 +251,10 @@ class Block:
 
 def analyse_block(
     context: AnalysisContext,
-    movie: CountSource,
-    camera: Camera,
+    recording: Recording,
     span: tuple[int, int],
     *,
     goes_on: tuple[bool, bool],
-    check: Callable[[NDArray[Any], int], None],
-    pool: ThreadPoolExecutor,
-    progress: Progress,
     cautious: bool = False,
 ) -> Block:
     """Analyse the particles of a block of frames."""
@@ -267,10 +262,7 @@ def analyse_block(
     # Nearer to a border than this a track may go on in the next block.
     near = context.config.track.memory_frames + 1
     inner = (near if goes_on[0] else 0, frames - near if goes_on[1] else frames)
-    moving = find_rows_and_background(
-        context, movie, camera, span,
-        check=check, pool=pool, progress=progress, inner=inner, cautious=cautious,
-    )  # fmt: skip
+    moving = find_rows_and_background(context, recording, span, inner=inner, cautious=cautious)
     field, ground, rows = moving.field, moving.ground, moving.rows
 
     def without(count: int) -> FloatArray:
@@ -281,9 +273,8 @@ def analyse_block(
     if not goes_on[0]:
         seen = rows.frame + first, rows.theta[:, :2]
         pictures = start_in_thread(align, context, moving)
-        judged = start_in_thread(
-            judge_beside, context, movie, camera, span, seen, field.used, without
-        )
+        source = recording.movie, recording.camera
+        judged = start_in_thread(judge_beside, context, *source, span, seen, field.used, without)
     table, inside = moving_table(context, moving, first), field.holds(rows.theta)
     masses = common_masses(context, moving)
     best = table.loc[table[inside].groupby("track")["snr"].idxmax()]

@@ -275,12 +275,10 @@ BLOCK = 32
 
 _FRAMES_PER_SWEEP = 4  # of them, where every row is fitted several times
 _TOLERANCE = 2e-4  # as in `Likelihood.maximize`
-_ROUGH_TOLERANCE = 0.02  # the same, of a fit that the next turn goes on with
 _PASSES = 40
 _SLACK = np.array([0.1, 0.1, 0.01, 0.05])
 """How far particles may go from their rings: pixels, wavelengths, relative."""
 _NO_LIMIT = 1e300
-_ROOM_FACTOR = 2.0  # for which there is room, than those of the first fit: untouched it is free
 # Resolutions λ/NA outside the field, from where a particle is still seen
 _VISIBLE_RESOLUTIONS = 1.0
 
@@ -427,7 +425,8 @@ class MovingField:
         fits = Fits(np.full(n, CONVERGED, np.int64), np.zeros((n, 4, 4)), np.empty(n))
         canvas = self._canvas_for(rows, coarse=coarse)
         field = self._coarse if coarse else self._whole
-        search = self._search if sweeps > 1 else self._search._replace(tolerance=_ROUGH_TOLERANCE)
+        # a tolerance of 0.02 where the next turn goes on with the fit
+        search = self._search if sweeps > 1 else self._search._replace(tolerance=0.02)
         slopes = self._slopes_of(n, field.side if sweeps else 0)
         expected = np.zeros(self.frames)
 
@@ -646,7 +645,8 @@ class MovingField:
         size = rows * free * side**2
         if self._room_of_slopes.size < size:
             # It is cleared where it is first used, as long as a fit takes: once, for all to come.
-            most = round(_ROOM_FACTOR * rows) * free * self._whole.side**2
+            # room for 2.0 times the rows of the first fit: memory that is not touched is free
+            most = round(2.0 * rows) * free * self._whole.side**2
             self._room_of_slopes = np.empty(most, dtype=np.int16)
         values = self._room_of_slopes[:size].reshape(rows, free, side**2)
         squares, units, moves = np.zeros((rows, 4), dtype=np.int64), *np.zeros((2, rows, free))

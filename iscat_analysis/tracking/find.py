@@ -29,7 +29,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from iscat_analysis.camera import Camera, Check, add_frames, start_power
 from iscat_analysis.config import Config
@@ -55,7 +54,6 @@ from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.optics.model import PATH_SPREAD, blurred, path_variance_nm2
 from iscat_analysis.records import (
     BoolArray,
-    CountSource,
     EventView,
     FloatArray,
     FrameSource,
@@ -73,6 +71,7 @@ from iscat_analysis.threads import start_in_thread, threads
 from iscat_analysis.tracking.blocks import Block, BlockStore, analyse_block, finding_of, join_blocks
 from iscat_analysis.tracking.frames import (
     Plan,
+    Recording,
     exposure_of,
     keep_frames,
     plan_blocks,
@@ -93,39 +92,31 @@ MOST_REJECTED = 0.5
 FEW_REJECTED = 0.25
 """Share of the rows at one height up to which it describes them: of membranes a hundredth is."""
 
-_LOOKED_AT = 200  # frames
-_ENOUGH = 30  # rows that tell
 _REJECTED = "|".join([Status.NOT_CONVERGED, Status.AT_BOUND, Status.POOR_FIT])
 
 
 def held_height_warning(
-    config: Config,
-    movie: CountSource,
-    camera: Camera,
-    span: tuple[int, int],
-    fits: pd.DataFrame,
-    *,
-    check: Callable[[NDArray[Any], int], None],
-    pool: ThreadPoolExecutor,
+    config: Config, recording: Recording, span: tuple[int, int], fits: pd.DataFrame
 ) -> Finding | None:
     """Find whether particles seem to stay at one height, where fits with free heights fail."""
     if config.track.free != "joint" or not len(fits):
         return None
-    first, last = span[0], min(span[1], span[0] + _LOOKED_AT)
+    first, last = span[0], min(span[1], span[0] + 200)
     free = _rejected(fits[(fits["frame"] >= first) & (fits["frame"] < last)])
     if free.size == 0 or free.mean() <= MOST_REJECTED:
         return None
     track = config.track.model_copy(update={"free": "mass"})
-    config, (_, tall, wide) = config.model_copy(update={"track": track}), movie.shape
+    config = config.model_copy(update={"track": track})
+    movie = recording.movie
+    _, tall, wide = movie.shape
     context = tracking_context(config, (tall, wide), last - first)
     try:
-        moving = find_rows_and_background(
-            context, movie, camera, (first, last), check=check, pool=pool, progress=silent
-        )
+        quietly = replace(recording, progress=silent)
+        moving = find_rows_and_background(context, quietly, (first, last))
     except DataError:  # nothing can be followed at one height
         return None
     held = _rejected(moving_table(context, moving, first)[moving.field.holds(moving.rows.theta)])
-    if held.size < _ENOUGH or 2 * held.size < free.size or held.mean() > FEW_REJECTED:
+    if held.size < 30 or 2 * held.size < free.size or held.mean() > FEW_REJECTED:  # rows that tell
         return None
     values = {"free": int(free.sum()), "free_of": free.size, "fixed": int(held.sum())}
     height = {"fixed_of": held.size, "height_nm": context.model.height_nm}
@@ -135,11 +126,6 @@ def held_height_warning(
 def _rejected(rows: pd.DataFrame) -> BoolArray:
     """Tell which rows the model does not describe."""
     return np.asarray(rows["flags"].fillna("").str.contains(_REJECTED), dtype=np.bool_)
-
-
-_MOST_TURNS = 12
-_SETTLED = 0.3  # change of the background, in σ of the mass of a track that has all of it
-_LARGEST_FACTOR = 0.8  # of a step to the one before, with which the end is extrapolated
 
 
 Track = Callable[[AnalysisContext, Windows], DetectionResult]
@@ -153,18 +139,20 @@ def in_turns(
     sharp, variance_nm2 = context, 0.0
     upwards = config.track.free == "joint"
     last: FloatArray | None = None
-    for turn in range(_MOST_TURNS):
+    for turn in range(12):
         found = track(context, windows)
         if found.interrupted:
             break
         ground = beside_particles(context, windows, found.fits)
         error = np.sqrt(np.maximum(ground + windows.read_variance_before_e2, 1.0))
         step = np.where(windows.masked, 0.0, (ground - windows.before_e) / error)
-        if turn > 1 and math.sqrt(np.sum(step**2)) < _SETTLED:
+        # 0.3 σ of the mass of a track, if all of the change were its own
+        if turn > 1 and math.sqrt(np.sum(step**2)) < 0.3:
             break
         if last is not None:  # turns come nearer by one factor each, as slowly as particles move
             factor = np.sum(step * last) / np.sum(last**2)
-            step = step / (1 - min(max(factor, 0.0), _LARGEST_FACTOR))
+            # factors above 0.8 are not extrapolated
+            step = step / (1 - min(max(factor, 0.0), 0.8))
         last = step if turn else None
         windows = replace(windows, before_e=np.maximum(windows.before_e + step * error, 0.0))
         variance_nm2 = _path_variance_nm2(config, found.fits)
@@ -247,27 +235,21 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
         return shelves[-1]
 
     with _with_resumption_hint(shelves, plan), threads(config.compute.workers) as pool:
+        recording = Recording(movie, camera, check, pool, run.progress)
 
         def begin(config: Config, *, cautious: bool = False) -> TrialTracks:
             context = tracking_context(config, ready.shape, max(last - first, 1), ready.lines)
-            block = _analysed(
-                context, movie, camera, plan, shelf(config, None if cautious else run.partial), 0,
-                check=check, pool=pool, progress=run.progress, cautious=cautious,
-            )  # fmt: skip
+            store = shelf(config, None if cautious else run.partial)
+            block = _analysed(context, recording, plan, store, 0, cautious=cautious)
             return TrialTracks(config, context, block)
 
         begun, learned = learn_from_tracks(config, begin, name=movie.name, pool=pool, run=run)
         config, context = begun.config, begun.context
-        blocks, interrupted = track_movie(
-            context, movie, camera, plan, shelf(config, run.partial),
-            check=check, pool=pool, progress=run.progress, first=begun.block,
-        )  # fmt: skip
+        store = shelf(config, run.partial)
+        blocks, interrupted = track_movie(context, recording, plan, store, begun.block)
         joined = join_blocks(config, blocks, camera)
         if not interrupted and not fixed_height_warning(config, joined.fits):
-            fixed = held_height_warning(
-                ready.config, movie, camera, plan.spans[0], joined.fits, check=check, pool=pool
-            )
-            run.report(fixed)
+            run.report(held_height_warning(ready.config, recording, plan.spans[0], joined.fits))
     windows = joined.followed.windows
     noise = [] if jitter else [finding_of(text) for text in blocks[0].noise]
     run.report(*noise, *pixel_warnings(*windows.left_out))
@@ -342,61 +324,39 @@ def _nothing_found(context: AnalysisContext, block: Block, name: str) -> Finding
 
 
 def track_movie(
-    context: AnalysisContext,
-    movie: CountSource,
-    camera: Camera,
-    plan: Plan,
-    store: BlockStore,
-    *,
-    check: Check,
-    pool: ThreadPoolExecutor,
-    progress: Progress,
-    first: Block | None = None,
+    context: AnalysisContext, recording: Recording, plan: Plan, store: BlockStore, first: Block
 ) -> tuple[list[Block], bool]:
     """Track particles that are there in all frames, over backgrounds learnt with them."""
-    blocks: list[Block] = [] if first is None else [first]
-    interrupted = False
+    blocks, interrupted = [first], False
     try:
-        for number in range(len(blocks), len(plan.spans)):
-            block = _analysed(
-                context, movie, camera, plan, store, number,
-                check=check, pool=pool, progress=progress,
-            )  # fmt: skip
-            blocks.append(block)
+        for number in range(1, len(plan.spans)):
+            blocks.append(_analysed(context, recording, plan, store, number))
     except KeyboardInterrupt:
-        if not blocks:
-            raise
-        progress("report", 0, 1)  # what was finished is now gathered and kept, which takes a moment
-        pool.shutdown(wait=False, cancel_futures=True)
+        recording.progress("report", 0, 1)  # to gather and keep finished blocks takes a moment
+        recording.pool.shutdown(wait=False, cancel_futures=True)
         interrupted = True
     return blocks, interrupted
 
 
 def _analysed(
     context: AnalysisContext,
-    movie: CountSource,
-    camera: Camera,
+    recording: Recording,
     plan: Plan,
     store: BlockStore,
     number: int,
     *,
-    check: Check,
-    pool: ThreadPoolExecutor,
-    progress: Progress,
     cautious: bool = False,
 ) -> Block:
     """Load a finished block, or analyse it."""
     count, span = len(plan.spans), plan.spans[number]
-    block_progress = progress if count == 1 else _part_of(progress, number, count)
+    if count > 1:
+        recording = replace(recording, progress=_part_of(recording.progress, number, count))
     block: Block | None = store.load(number)
     if block is not None and block.span == span:
-        block_progress("track", 1, 1)
+        recording.progress("track", 1, 1)
         return block
-    block = analyse_block(
-        context, movie, camera, span,
-        goes_on=(number > 0, number + 1 < count),
-        check=check, pool=pool, progress=block_progress, cautious=cautious,
-    )  # fmt: skip
+    goes_on = number > 0, number + 1 < count
+    block = analyse_block(context, recording, span, goes_on=goes_on, cautious=cautious)
     store.save(number, block)
     return block
 

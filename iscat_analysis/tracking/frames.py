@@ -23,7 +23,6 @@ of all pixels together, and particles hardly pull at it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -36,6 +35,7 @@ from scipy.special import chdtri
 
 from iscat_analysis.camera import (
     Camera,
+    Check,
     LightModel,
     Trajectory,
     find_defects,
@@ -79,11 +79,7 @@ MOST_DRIFT_OVER_COUNTING = 5.0
 than a pixel does: it stays at a place for many frames and makes the same error in all of them,
 while the errors that a steady drift makes before and after the middle of a block cancel."""
 
-_SUMS = 64  # of frames, at most, between which the pattern is followed
-_LEAST_SUM = 20  # frames in each: particles in them pull at the pattern less, the more there are
-_SUMS_SHARE = 0.25  # of compute.memory_limit_mb, for these sums
 _READ = 64  # frames read at a time
-_SMALLEST_PX = 32  # side of a field in which a pattern is followed
 
 
 @dataclass(frozen=True)
@@ -131,7 +127,7 @@ def plan_blocks(
     config: Config,
     camera: Camera,
     *,
-    check: Callable[[NDArray[Any], int], None],
+    check: Check,
     span: tuple[int, int] | None = None,
     mapper: Mapper = map,
 ) -> Plan:
@@ -150,7 +146,8 @@ def plan_blocks(
             "MB of memory, more than compute.memory_limit_mb = "
             f"{config.compute.memory_limit_mb}: {advice}"
         )
-    if given is not None or frames < 2 * SHORTEST or min(movie.shape[1:]) < _SMALLEST_PX:
+    # a pattern is followed in fields of 32 pixels and more
+    if given is not None or frames < 2 * SHORTEST or min(movie.shape[1:]) < 32:
         return Plan(_spans(first, last, count))
     motion, stiffness = follow_light(
         movie, camera, (first, last), config, check=check, mapper=mapper
@@ -192,7 +189,7 @@ def follow_light(
     span: tuple[int, int],
     config: Config,
     *,
-    check: Callable[[NDArray[Any], int], None],
+    check: Check,
     mapper: Mapper = map,
 ) -> tuple[Trajectory | None, FloatArray]:
     """Measure how the fixed pattern moves through a movie, and its stiffness per squared pixel.
@@ -201,8 +198,10 @@ def follow_light(
     """
     first, last = span
     shape = (movie.shape[1], movie.shape[2])
-    most = int(_SUMS_SHARE * config.compute.memory_limit_mb * 1e6 / (8 * math.prod(shape)))
-    count = max(2, min(_SUMS, most, (last - first) // _LEAST_SUM))
+    # the sums between which the pattern is followed take a quarter of the memory
+    most = int(0.25 * config.compute.memory_limit_mb * 1e6 / (8 * math.prod(shape)))
+    # at most 64 sums, of 20 frames or more: the more frames, the less particles in them pull
+    count = max(2, min(64, most, (last - first) // 20))
     spans = _spans(first, last, count)
     sums, saturated = np.zeros((count, *shape)), np.zeros(shape, dtype=bool)
 
@@ -263,8 +262,6 @@ def _spans(first: int, last: int, count: int) -> tuple[tuple[int, int], ...]:
 MANY = 0.05
 """Share of the frames that may be left out without a word on what that means."""
 
-_NAMED = 4
-
 
 @dataclass(frozen=True)
 class FrameSubset:
@@ -314,7 +311,7 @@ def keep_frames(
             f"; {share:.0%} of the frames: if the file holds each of the camera's several times, D "
             "is too small by as much; export it with each once, at the camera's own rate"
         )
-    values |= {"frames": listed(missing, _NAMED), "many": many}
+    values |= {"frames": listed(missing, 4), "many": many}
     finding = TRACKED_FRAMES_LEFT_OUT(values, where=movie.name)
     return FrameSubset(seen, (0, len(numbers)), numbers, finding)
 
@@ -349,10 +346,6 @@ LEAST_FRAMES = 20
 """Frames in a movie at least: fewer leave the background to the particles."""
 
 
-_PAIRS = 100  # of successive frames, which tell how noisy a pixel is
-_NOISY = 3.0  # times the variance of its light, and of the pixels around it
-_BY_CHANCE = 1e-9  # of a pixel that is not
-_AROUND = 7  # pixels, along each axis
 _BLOCK = 16  # frames that are read or searched at a time; what more of them need is slow to clear
 
 
@@ -381,17 +374,22 @@ def initial_background(config: Config, field: MovingField) -> BackgroundEstimate
     return ground
 
 
+@dataclass(frozen=True)
+class Recording:
+    """A movie that is followed, its camera, a check of frames that are read, and threads."""
+
+    movie: CountSource
+    camera: Camera
+    check: Check
+    pool: ThreadPoolExecutor
+    progress: Progress
+
+
 def load_field(
-    context: AnalysisContext,
-    movie: CountSource,
-    camera: Camera,
-    span: tuple[int, int],
-    check: Callable[[NDArray[Any], int], None],
-    pool: ThreadPoolExecutor,
-    progress: Progress,
+    context: AnalysisContext, recording: Recording, span: tuple[int, int]
 ) -> MovingField:
     """Read the frames; they stay integers where that takes less memory."""
-    first, last = span
+    movie, camera, (first, last) = recording.movie, recording.camera, span
     frames, shape = last - first, (movie.shape[1], movie.shape[2])
     refuse_few_frames(movie.name, frames)
     exposures = _room_for((frames, *shape), movie.dtype, camera)
@@ -400,7 +398,7 @@ def load_field(
 
     def read_some(start: int) -> tuple[BoolArray, FloatArray]:
         raw = movie.read(start, min(start + _BLOCK, last))
-        check(raw, start)
+        recording.check(raw, start)
         part = counts[start - first : start - first + len(raw)]
         part[:] = raw if counts.dtype == np.uint16 else camera.to_electrons(raw)
         light[start - first :][: len(raw)] = part.mean(axis=(1, 2), dtype=np.float64)
@@ -408,10 +406,10 @@ def load_field(
         return full, np.sum(part, axis=0, dtype=np.float64)
 
     starts = range(first, last, _BLOCK)
-    for start, (full, added) in zip(starts, pool.map(read_some, starts), strict=True):
+    for start, (full, added) in zip(starts, recording.pool.map(read_some, starts), strict=True):
         saturated |= full
         total += added
-        progress("background", min(start + _BLOCK, last) - first, frames)
+        recording.progress("background", min(start + _BLOCK, last) - first, frames)
     read = np.broadcast_to(camera.read_variance_e2(shape), shape)
     total, light = exposures.in_electrons(total, frames), exposures.in_electrons(light, 1)
     masked = saturated | find_defects(total, frames * read)
@@ -422,7 +420,7 @@ def load_field(
         exposures, read, ~masked, context.model, context.wide,
         pixel_nm=context.pixel_nm, roi_px=context.roi_px,
         z_range_nm=context.config.fit.z_range_nm if free_z else None,
-        largest=100 * nominal, pool=pool, saturated=saturated,
+        largest=100 * nominal, pool=recording.pool, saturated=saturated,
     )  # fmt: skip
 
 
@@ -438,10 +436,9 @@ def refuse_few_frames(name: str, frames: int) -> None:
 
 def restore_particle_light(
     context: AnalysisContext,
-    field: MovingField,
-    movie: CountSource,
-    camera: Camera,
+    recording: Recording,
     first: int,
+    field: MovingField,
     ground: BackgroundEstimate,
     rows: Localizations,
 ) -> None:
@@ -456,7 +453,8 @@ def restore_particle_light(
     signal = field.draw(ground, rows, coarse=False)
 
     def block(start: int, stop: int) -> FloatArray:
-        divided = camera.to_electrons(movie.read(first + start, first + stop))
+        raw = recording.movie.read(first + start, first + stop)
+        divided = recording.camera.to_electrons(raw)
         return np.multiply(divided, lines.taken(signal[start:stop].astype(np.float64)))
 
     field.renew(block)
@@ -476,7 +474,8 @@ def _noisy(exposures: Exposures, light_e: FloatArray, variance_e2: FloatArray) -
     Particles that move change the light from frame to frame as well, of many pixels together.
     """
     frames = len(light_e)
-    firsts = np.arange(0, frames - 1, max(2, frames // _PAIRS))
+    # 100 pairs of successive frames tell how noisy a pixel is
+    firsts = np.arange(0, frames - 1, max(2, frames // 100))
     light = light_e / (light_e.mean() or 1.0)
     squares = np.zeros(variance_e2.shape)
     for t in firsts.tolist():
@@ -484,9 +483,10 @@ def _noisy(exposures: Exposures, light_e: FloatArray, variance_e2: FloatArray) -
             one, other = exposures.electrons(t), exposures.electrons(t + 1)
             squares += (one / light[t] - other / light[t + 1]) ** 2
     noise = squares / (2 * len(firsts) * np.maximum(variance_e2, 1.0))
-    most = max(_NOISY, float(chdtri(len(firsts), _BY_CHANCE)) / len(firsts))
+    # 3.0 times the variance of the light, and more than chance makes once in 1e9 pixels
+    most = max(3.0, float(chdtri(len(firsts), 1e-9)) / len(firsts))
     noisy = noise > most
     if noisy.any():  # else nobody needs to know how noisy those around are
-        around = median_filter(noise, size=_AROUND, mode="nearest")
+        around = median_filter(noise, size=7, mode="nearest")  # pixels, along each axis
         noisy &= noise > most * around
     return np.asarray(noisy)

@@ -55,15 +55,9 @@ _SETTLED = 0.1  # step of the background, in its own standard deviations, that i
 _NEXT_STEP_SETTLED = 0.02  # the same, of the next step if it shrinks as the last one did
 _ROUGH_STEP = 2.0  # step that is the last one while particles are still being looked for
 _NEAR_STEP, _FAR_STEP = 0.5, 5.0  # one below the former after one above the latter: new rings
-_MEDIAN_FRAMES = 400  # that suffice: particles are found over it, and fitted over a better one
 _DAMPING = 0.01  # of Newton's step, at first and at least: by as much 1 − E is wrong
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.25  # by what it changes where the turns grow, or shrink fast
-_POWER_TURNS = 3  # over a background that stays
-_POWER_SETTLED = 1e-7
-_LIKELIHOOD_NOISE = 0.5  # of the log-likelihood, by how the canvas is drawn
-_LEAST_GAIN = 0.05  # expected gain of the step that is the last one
 _MOST_STEPS = 40
-_MOST_SIGNAL = 0.99  # signal of a pixel that is taken to be none of a particle's
 
 
 def ascend(
@@ -77,7 +71,7 @@ def ascend(
         found = BackgroundEstimate(found.level, found.power if follow_power else ground.power)
         move = np.where(field.used, np.log(found.level / ground.level), 0.0)
         value = log_likelihood(field, found, rows)
-        if value < best - _LIKELIHOOD_NOISE:
+        if value < best - 0.5:  # noise of the drawing
             rows, ground = kept
             damping *= _DAMPING_UP
             continue
@@ -85,7 +79,7 @@ def ascend(
         damping = max(0.5 * damping, _DAMPING)
         step, gain = _damped_step(field, move, counts, damping)
         ground = BackgroundEstimate(found.level * np.exp(step - move), found.power)
-        if gain < _LEAST_GAIN:
+        if gain < 0.05:  # expected gain of the step that is the last one
             return field.followed(rows, step), ground, done
     return *kept, done
 
@@ -108,7 +102,8 @@ def log_likelihood(field: MovingField, ground: BackgroundEstimate, rows: Localiz
 
     def block(first: int) -> FloatArray:
         here = slice(first, first + BLOCK)
-        signal = np.maximum(total[here].astype(np.float64), -_MOST_SIGNAL)
+        # a signal below −0.99 is none of a particle
+        signal = np.maximum(total[here].astype(np.float64), -0.99)
         bright = power[here, None, None] * (1 + signal)
         seen = np.einsum("tyx,tyx->yx", field.exposures.electrons(here), np.log1p(signal))
         return np.stack([seen, bright.sum(axis=0)])
@@ -123,7 +118,8 @@ def first_background(field: MovingField, *, follow_power: bool) -> BackgroundEst
     power = np.ones(field.frames)
     if follow_power:
         power = field.frame_totals / field.frame_totals.mean()
-    some = slice(None, None, max(field.frames // _MEDIAN_FRAMES, 1))
+    # 400 frames suffice: particles are found over their median, and fitted over a better one
+    some = slice(None, None, max(field.frames // 400, 1))
     scale = (1 / power[some]).astype(np.float32)
     level = np.empty(field.used.shape)
 
@@ -154,9 +150,9 @@ def fit_jointly(
         rows, found, done = field.fit(ground, rows, coarse=coarse)
         power = found.power if follow_power else ground.power
         if not follow_level:
-            steady = bool(np.abs(power - ground.power).max() < _POWER_SETTLED)
+            steady = bool(np.abs(power - ground.power).max() < 1e-7)
             ground = replace(ground, power=power)
-            if steady or turn + 1 >= _POWER_TURNS:
+            if steady or turn + 1 >= 3:  # over a background that stays
                 break
             continue
         move = np.where(field.used, np.log(found.level / ground.level), 0.0)
@@ -244,10 +240,7 @@ class Coupling:
 
 
 _SINGULAR = 1e-9
-_IMAGES = 4  # that are sent through E at a time
 MOST_VARIANCE_LEFT_OUT = 3e-4  # of the variance of a row, that may be left out
-_SEED = 1  # of the images to begin with
-_ROUNDS = 3  # of a mean and of the weights there
 _MOST_AMPLITUDE_RATIO = 2.0  # amplitude over the mean, beyond which weights stay
 # Of the information on a mass, that a step of the conjugate gradients adds
 _LEAST_INFORMATION_SHARE = 1e-6
@@ -311,7 +304,8 @@ def _krylov_part(coupling: Coupling, root: FloatArray, most: float) -> FloatArra
     n, free = root.shape[:2]
     covariance = root @ np.swapaxes(root, 1, 2)
     rank = min(n * free, coupling.pixels)
-    some = np.random.default_rng(_SEED).standard_normal((n, min(_IMAGES, rank), free))
+    # four images are sent through E at a time
+    some = np.random.default_rng(1).standard_normal((n, min(4, rank), free))
     images = coupling.sent(some @ np.swapaxes(root, 1, 2))
     basis, felt = np.empty((0, coupling.pixels)), np.empty((n, 0, free))
     largest = 1.0
@@ -429,7 +423,7 @@ def _at_their_mean(
     """Give the mean of amplitudes, and by what the information on each is more at that."""
     power = np.average(growth, weights=information)
     mean, more = float(np.average(estimate, weights=information)), np.ones(len(estimate))
-    for _ in range(_ROUNDS):
+    for _ in range(3):  # of the mean and its weights
         more = np.clip(amplitude / mean, 1 / _MOST_AMPLITUDE_RATIO, _MOST_AMPLITUDE_RATIO) ** -power
         mean = float(np.average(estimate, weights=information * more))
     return mean, more

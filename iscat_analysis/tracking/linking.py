@@ -53,7 +53,6 @@ LEAST_SNR = 4.0
 LEAST_SHARE = 0.5
 """Of its track's mass that it needs beside another: one particle is not two of half the mass."""
 
-_SWEEPS = 6  # fits in turn of particles that overlap
 # Resolutions λ/NA within which particles are fitted from their predictions
 _MEETING_RESOLUTIONS = 1.5
 _SAME_RESOLUTIONS = 0.25  # resolutions within which two rows are one particle
@@ -106,7 +105,7 @@ def extended(
         if not proposed:
             break
         trial = _starts(frames, proposed, typical, blur, meeting)
-        fitted, done = field.refit(ground, trial, sweeps=_SWEEPS)
+        fitted, done = field.refit(ground, trial, sweeps=6)
         good = done & (fitted.snr > LEAST_SNR)
         ends = []
         for t, new in proposed.items():
@@ -193,8 +192,6 @@ AS_FOUND = 0.9
 
 # Of the farthest that a particle goes: what an error of the mass counts in linking
 _MASS_STEP_SHARE = 0.1
-_MASS_ERROR_FREE_Z = 0.25  # of the mass, where z is free
-_NEAR_RESOLUTIONS = 0.75  # resolutions λ/NA within which two rows may be one particle
 _BRIDGE_FRAMES = 100  # that a slow particle may hide
 _MEETING = 5  # frames before and after two were crowded, in which one of them may be hidden
 
@@ -266,7 +263,7 @@ def with_mass(config: Config, rows: Localizations, error: float) -> FloatArray:
 def mass_error(config: Config, rows: Localizations, error: float) -> float:
     """Give the error of the mass that linking assumes between frames."""
     if config.track.free == "joint" and len(rows.frame):
-        return max(error, _MASS_ERROR_FREE_Z * float(np.median(rows.theta[:, 3])))
+        return max(error, 0.25 * float(np.median(rows.theta[:, 3])))  # of the mass
     return error
 
 
@@ -294,7 +291,8 @@ def alone(
     config = context.config
     if not len(rows.frame):
         return rows
-    near = crowded(rows, _NEAR_RESOLUTIONS * config.optics.wavelength_nm / config.optics.na)
+    # within 0.75 λ/NA two rows may be one particle
+    near = crowded(rows, 0.75 * config.optics.wavelength_nm / config.optics.na)
     tracks = int(rows.track.max(initial=0)) + 1
     free = np.bincount(rows.track[~near], minlength=tracks)
     keep = (free >= _least(config, rows, inner)) & seen(context, rows)
@@ -465,9 +463,6 @@ MERGED_FRAMES = 100
 """For which two particles may be one picture, and one track."""
 
 _APART_FRAMES = 5  # in which two must be apart before they meet again
-_NEIGHBOURS_FRAMES = 300  # who stay beside each other for longer are met by others one by one
-_LOG_ZERO = -1e9  # in log-likelihood
-_MASS_ERROR = 0.02  # of what neighbours do to all frames of a part, relative
 
 
 def identified(rows: Localizations, *, near_nm: float, error: float) -> Localizations:
@@ -530,7 +525,8 @@ class _Typical:
         moved = np.diff(theta[:, :2], axis=0)[np.diff(frame) == 1]
         steps = len(moved) * math.log(2) ** 2  # a median is as good as the mean of so many
         mass = float(np.median(theta[:, 3]))
-        variance = math.pi / 2 * self.error**2 / len(mine) + (_MASS_ERROR * mass) ** 2
+        # neighbours change all frames of a part by 2 % alike
+        variance = math.pi / 2 * self.error**2 / len(mine) + (0.02 * mass) ** 2
         square = steps * _variance_nm2(moved)
         return _Part(steps, square, mass, variance, frame[[0, -1]], theta[[0, -1], :2])
 
@@ -626,7 +622,7 @@ def _chains(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
     gain = LEAST_GAIN + np.array([[typical.evidence(a.before, b.after) for b in go] for a in come])
     linked = np.array([[a is b for b in go] for a in come])
     # what fits nothing may end or begin here if it does, and else goes on all the same
-    least = np.array([[0.0 if a.ends or b.begins else _LOG_ZERO for b in go] for a in come])
+    least = np.array([[0.0 if a.ends or b.begins else -1e9 for b in go] for a in come])
     worth = np.maximum(gain, least) + LEAST_GAIN / 2 * linked
     moves: dict[_Side, _Side] = {}
     for i, j in zip(*scipy.optimize.linear_sum_assignment(worth, maximize=True), strict=True):
@@ -705,7 +701,7 @@ def _of_one(rows: Localizations, pairs: list[_Pair]) -> Iterator[tuple[int, int]
             if pair.first - begins[other] <= _APART_FRAMES:
                 born[one].append((pair.first, k))
     for k, pair in enumerate(pairs):
-        brief = pair.last - pair.first <= _NEIGHBOURS_FRAMES
+        brief = pair.last - pair.first <= 300  # others meet lasting neighbours one by one
         for one, other in (pair.tracks, pair.tracks[::-1]):
             until = pair.last
             if ends[other] - pair.last <= _APART_FRAMES:

@@ -40,10 +40,8 @@ ROUNDS = 8
 """Of optics learned from tracks, and tracks followed with them, at most.  What is learned from
 tracks that were followed with wrong optics is only near the truth, as `instrument.loop` says."""
 
-_MOST_FAILED_ROUNDS = 4  # in which optics that describe the tracks at all are found, or never
 _NOISE = "the noise is not what the camera's numbers predict, and may be what is left over"
 _NO_BETTER = "what was learned does not describe them either"
-_LOOKED_AT = 24  # pictures in which the cause is looked for
 
 
 @dataclass(frozen=True)
@@ -195,7 +193,8 @@ class Tracks:
         near: Settings | None = None
         if rounds.all:
             last, number = rounds.all[-1], len(rounds.all)
-            lost = number == _MOST_FAILED_ROUNDS and not last.described and rounds.best is None
+            # optics that describe the tracks at all are found in 4 rounds, or never
+            lost = number == 4 and not last.described and rounds.best is None
             done = last.described and rounds.settled
             ahead = rounds.next if last.described else last.ahead
             if number == ROUNDS or lost or done or ahead is None:
@@ -289,7 +288,7 @@ def _cause(begun: TrialTracks) -> Cause | None:
     aligned, context = begun.block.aligned, begun.context
     if aligned is None:
         return None
-    shown = _brightest(aligned, _LOOKED_AT)
+    shown = _brightest(aligned, 24)
     fits = [(aligned.likelihood(context, n), aligned.theta[n], _free(context)) for n in shown]
     return likely_cause(context.config, fits)
 

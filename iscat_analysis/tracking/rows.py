@@ -155,9 +155,6 @@ class Judged:
         )
 
 
-_PARTS = 8  # of the clusters, that threads take in turn
-_STEP_RESIDUE = 0.02  # of a step that is left to the next
-_MOST_STEPS = 40  # of the conjugate gradients
 _FARTHEST = 0.05  # step of the logarithm of the background
 _LONGEST = np.array([50.0, 50.0, 20.0, 0.3, 0.0])
 """Step of rows that overlap [nm], relative; longer ones are shortened with their cluster."""
@@ -203,7 +200,7 @@ class Response:
 
     def _share(self, task: Callable[[int, int], T]) -> list[T]:
         """Run a task for parts of the clusters, half-open ranges, several at a time."""
-        edges = np.linspace(0, len(self._clusters.frame), _PARTS + 1).astype(int).tolist()
+        edges = np.linspace(0, len(self._clusters.frame), 8 + 1).astype(int).tolist()
         return list(self._pool.map(lambda part: task(*part), pairwise(edges)))
 
     def _room(self) -> tuple[NDArray[np.float32], FloatArray]:
@@ -244,8 +241,8 @@ class Response:
         step, _ = of.cg(
             of.LinearOperator(square, undetermined, dtype=np.float64),
             (counts * move).ravel(),
-            rtol=_STEP_RESIDUE,
-            maxiter=_MOST_STEPS,
+            rtol=0.02,  # of a step that is left to the next
+            maxiter=40,  # of the conjugate gradients
             M=of.LinearOperator(square, lambda v: v.ravel() / weight, dtype=np.float64),
         )
         return np.asarray(np.clip(step.reshape(move.shape), -_FARTHEST, _FARTHEST))

@@ -34,8 +34,6 @@ has been taken off: less may be what the model leaves over."""
 _HIGHER = 2.5
 """What rings may be through optics that are not the model's, over those of the model."""
 
-_FIELDS = 32  # of frames and templates that are filtered at a time
-
 
 @dataclass(frozen=True)
 class FrameCandidates:
@@ -96,7 +94,7 @@ class FrameFilter:
         """
         parts: list[FloatArray] = []
         threshold = self._templates.threshold
-        fields_at_once = max(_FIELDS // len(self._layers), 1)
+        fields_at_once = max(32 // len(self._layers), 1)
         for start in range(0, len(residual_e), fields_at_once):
             stop = start + fields_at_once
             snr = self._snr(residual_e[start:stop], power[start:stop])

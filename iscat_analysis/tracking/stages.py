@@ -12,24 +12,22 @@ that of the steps that it implies, is the largest (A. J. Viterbi, IEEE Trans. In
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from iscat_analysis.camera import Camera
-from iscat_analysis.camera.background import Check
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.optics.model import path_variance_nm2
-from iscat_analysis.records import BoolArray, CountSource, FloatArray, Progress
+from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.species.diffusion import estimate_diffusion
 from iscat_analysis.threads import start_in_thread
 from iscat_analysis.tracking.field import MovingField
 from iscat_analysis.tracking.frames import (
+    Recording,
     exposure_of,
     initial_background,
     load_field,
@@ -68,7 +66,6 @@ from iscat_analysis.tracking.search import FrameCandidates, search_frames
 IntArray = NDArray[np.int64]
 
 _BLOCK = 64  # frames at a time
-_LEAST_STEP = 0.05  # fringes: no particle is taken to move less between two frames
 
 
 def decide_heights(
@@ -105,7 +102,8 @@ def decide_heights(
         square = (steps**2).mean(axis=1) / apart
         per_frame = max(
             float(np.median(square)) / 0.6931 if len(square) else 0.0,
-            (_LEAST_STEP * fringe_nm) ** 2,
+            # no particle is taken to move by less than 0.05 fringes between two frames
+            (0.05 * fringe_nm) ** 2,
         )
         path = _best_path(candidates[mine, :, 2], values[mine], per_frame * apart)
         out[mine] = candidates[mine, path]
@@ -193,18 +191,12 @@ ROUNDS = 8
 _FIRST_TURNS = 2  # of background and particles after each of the first `_FULL` searches; after one
 # turn what hardly moves would be lost
 _NEXT_TURNS = 2  # between two extensions of the tracks
-_LEAST_POSITIONS = 4  # of a track whose D is fitted
-_LARGEST_ERROR_RATIO = 300.0  # times the median error of a track: such a place says nothing
 _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
 _BLUR_STEP = 0.03  # the same, relative
 _FEW = 0.01  # of all rows: a search that adds no more is the last, and an extension
 _FEW_TRIED = 5e-3  # the same, of one with places that are only tried, which the next one judges
 _AROUND = 5  # rows of a track, to whose median each is compared
-_OUTLIER_RMS = 5.0  # rms of the distance from there; of normal errors 1 in 10¹¹ is larger
-_LINKER_ROWS_PER_FRAME = 1.5  # rows in a frame, from which some will be linked by trackpy
-_MOST_ROWS_PER_AREA = 0.15  # rows in an area of (λ/NA)², beyond which they are no particles
 _FULL = 2  # searches of all frames, after which some of them tell whether to go on
-_TRIAL_ROUNDS = 2  # in which slow particles are tried where they were not detected
 
 
 @dataclass(frozen=True)
@@ -216,11 +208,9 @@ class Task:
     """
 
     context: AnalysisContext
-    field: MovingField
-    movie: CountSource
-    camera: Camera
+    recording: Recording
     first: int
-    pool: ThreadPoolExecutor
+    field: MovingField
     inner: tuple[int, int] | None
     cautious: bool
 
@@ -313,13 +303,14 @@ def search(task: Task, state: State) -> State:
     for number in range(ROUNDS):
         before = len(state.rows.frame)
         found = search_frames(
-            task.context, task.field, state.ground, state.rows, task.pool,
+            task.context, task.field, state.ground, state.rows, task.recording.pool,
             enough=round(_FEW * before) if number >= _FULL else 0, cautious=task.cautious,
         )  # fmt: skip
         if number and len(found.frame) <= _FEW * before:
             break
         rows = _joined(task.context, state.rows, found)
-        if len(rows.frame) > _LINKER_ROWS_PER_FRAME * len(np.unique(rows.frame)):
+        # from 1.5 rows in a frame on, trackpy will link some
+        if len(rows.frame) > 1.5 * len(np.unique(rows.frame)):
             start_in_thread(load_linker)  # there will be a choice
         state = replace(state, rows=rows)
         state = task.fitted(state, _FIRST_TURNS if number < _FULL else 1)
@@ -349,7 +340,8 @@ def extend(task: Task, state: State) -> State:
                 resolution_nm=task.resolution_nm, reach_nm=task.config.track.max_step_nm,
             )  # fmt: skip
         rows = alone(task.context, task.linked(rows, bridged=True), inner=task.inner)
-        ground, trial = state.ground, number < _TRIAL_ROUNDS
+        # in two rounds slow particles are tried where they were not detected
+        ground, trial = state.ground, number < 2
         if trial and task.learns_background and not task.cautious:
             rows, tried = extrapolated(task.config, task.field, rows)
             added += tried
@@ -385,7 +377,7 @@ def refine(task: Task, state: State) -> State:
 def _restored(task: Task, state: State) -> State:
     """Undo what was divided out with the particles, and choose the fringes of their rows."""
     restore_particle_light(
-        task.context, task.field, task.movie, task.camera, task.first, state.ground, state.rows
+        task.context, task.recording, task.first, task.field, state.ground, state.rows
     )
     state = task.in_fringes(state)
     return replace(state, rows=without_outliers(state.rows))
@@ -397,19 +389,15 @@ STAGES = (search, extend, identify, settle, refine)
 
 def find_rows_and_background(
     context: AnalysisContext,
-    movie: CountSource,
-    camera: Camera,
+    recording: Recording,
     span: tuple[int, int],
     *,
-    check: Check,
-    pool: ThreadPoolExecutor,
-    progress: Progress,
     inner: tuple[int, int] | None = None,
     cautious: bool = False,
 ) -> TrackedRows:
     """Find and fit every particle in every frame."""
-    field = load_field(context, movie, camera, span, check, pool, progress)
-    task = Task(context, field, movie, camera, span[0], pool, inner, cautious)
+    field, progress = load_field(context, recording, span), recording.progress
+    task = Task(context, recording, span[0], field, inner, cautious)
     nothing = np.zeros(0, dtype=np.int64)
     state = State(
         rows=Localizations.of(nothing, nothing, np.zeros((0, 5))),
@@ -447,7 +435,8 @@ def _refuse_flood(task: Task, rows: Localizations) -> None:
     """Refuse a frame with more rows than particles that could be resolved."""
     area = (task.field.pixel_nm / 1e3) ** 2 * float(task.field.used.sum())
     each = len(rows.frame) / task.field.frames
-    if each > _MOST_ROWS_PER_AREA * area / (task.resolution_nm / 1e3) ** 2:
+    # more than 0.15 rows in an area of (λ/NA)² are no particles
+    if each > 0.15 * area / (task.resolution_nm / 1e3) ** 2:
         raise DataError(
             f"{each:.0f} places in every frame of {area:.0f} um2 look like particles, more than "
             "can be told apart: the light changes from frame to frame, as where the stage drifts "
@@ -503,8 +492,9 @@ def diffusion_of(config: Config, free: BoolArray, rows: Localizations) -> FloatA
         mine = apart & (rows.track == k)
         error = sigma[:, axes].max(axis=1)
         if mine.any():
-            mine &= error < _LARGEST_ERROR_RATIO * np.nanmedian(error[mine])
-        if mine.sum() < _LEAST_POSITIONS:
+            # a place with 300 times the median error of its track tells nothing
+            mine &= error < 300.0 * np.nanmedian(error[mine])
+        if mine.sum() < 4:
             continue
         out[k] = estimate_diffusion(
             rows.frame[mine],
@@ -547,7 +537,8 @@ def without_outliers(rows: Localizations) -> Localizations:
         positions = theta[mine, :2]
         usual = median_filter(positions, size=(_AROUND, 1), mode="nearest")
         distance_squared = ((positions - usual) ** 2).sum(axis=1)
-        outliers = distance_squared > _OUTLIER_RMS**2 * mean_square(positions - usual)
+        # of normal errors 1 in 10¹¹ is larger than 5 root mean squares
+        outliers = distance_squared > 5.0**2 * mean_square(positions - usual)
         theta[mine[outliers], :2] = usual[outliers]
         theta[mine[outliers], 3] = np.median(theta[mine, 3])
     return replace(rows, theta=theta)

@@ -41,7 +41,6 @@ SKEW, SKEW_ACROSS = math.sqrt(0.90), math.sqrt(0.241)
 """Root mean squares of the third moments M_zzz and M_xzz over q to the power 3/2, of 2·10⁴ paths of
 400 steps each."""
 
-_PER_FRINGE = 8  # heights at which errors are computed; linear in between
 _STEP_NM = 2.0  # along z, of differences
 
 
@@ -93,7 +92,8 @@ def _interpolated(
 
     Shapes: `z_nm` (n,), result (n, …).
     """
-    count = max(2, math.ceil(np.ptp(z_nm) / model.fringe_nm * _PER_FRINGE) + 1)
+    # 8 heights in a fringe, linear in between
+    count = max(2, math.ceil(np.ptp(z_nm) / model.fringe_nm * 8) + 1)
     heights = np.linspace(z_nm.min(), max(z_nm.max(), z_nm.min() + _STEP_NM), count)
     table = np.stack([errors(height) for height in heights.tolist()])
     return np.asarray(scipy.interpolate.make_interp_spline(heights, table, k=1)(z_nm))
@@ -159,9 +159,6 @@ LARGEST_LOSS = 0.2
 over a normal spread no longer describes the path: it is too dark by a fifth of the square of this
 share, 1 %."""
 
-_FAINTEST = 1e-3  # of the brightest row: a fit that ended fainter tells nothing of its path
-_HEIGHTS = 65  # at which quantum bounds are computed where z is free; linear in between
-_TESTS = 2
 _APART = 0.05  # relative step of a blur
 
 
@@ -260,7 +257,8 @@ def common_masses(context: AnalysisContext, moving: TrackedRows) -> pd.DataFrame
     rows = moving.rows
     each = _path_errors(context, moving, losses_to_blur(context, moving)[rows.group])[:, 3]
     strength = np.abs(rows.theta[:, 3])
-    share = (each / np.maximum(strength, _FAINTEST * strength.max(initial=1e-9))) ** 2
+    # a fit that ended fainter than 1e-3 of the brightest row tells nothing of its path
+    share = (each / np.maximum(strength, 1e-3 * strength.max(initial=1e-9))) ** 2
     count = np.maximum(np.bincount(rows.track, minlength=len(mass)), 1)
     path = np.bincount(rows.track, weights=share, minlength=len(mass)) / count
     path /= np.maximum(common.frames, 1.0)
@@ -312,7 +310,7 @@ def _p_values(
     spread = np.minimum(2 * np.minimum(above, below), 1.0)
     outlier = -np.expm1(pixels * np.log1p(-np.minimum(2 * ndtr(-worst), 1 - 1e-16)))
     least = np.minimum(np.minimum(spread, outlier), 1 - 1e-16)
-    return np.asarray(-np.expm1(_TESTS * np.log1p(-least)))
+    return np.asarray(-np.expm1(2 * np.log1p(-least)))
 
 
 def _off_line(context: AnalysisContext, moving: TrackedRows, sigma_kda: FloatArray) -> BoolArray:
@@ -372,7 +370,8 @@ def _heights(z_nm: FloatArray) -> FloatArray:
     if not len(z_nm):
         return np.zeros(1)
     low, high = np.maximum([z_nm.min(), z_nm.max()], 0.0).tolist()
-    return np.array([low]) if low == high else np.linspace(low, high, _HEIGHTS)
+    # linear between 65 heights
+    return np.array([low]) if low == high else np.linspace(low, high, 65)
 
 
 def collected_areas(model: ForwardModel, z_nm: FloatArray, amplitude: FloatArray) -> FloatArray:

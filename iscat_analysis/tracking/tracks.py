@@ -72,12 +72,7 @@ LEAST_COMMON_SHARE = 0.05
 MANY_FRAMES_MISSING = 8
 """Frames missing at once, which are not the run of two or three where single ones are dropped."""
 
-_SOUND = 0.5  # of a track's rows that are ok: others may be two halves of something else
-_LEAST_STEPS = 20  # of a track, which tell how far it goes
-_LEAST_PAIRS = 30  # of frames
-_SIGNIFICANT = 5.0  # standard errors
 _UNLIKELY = 8.0  # of log-likelihood: one good movie in e⁸ at most
-_OTHERS = 7.0  # the same, of all particles but the one that went farthest, which may be another
 _GAPS = (2, 3, 5, 8, 13, 20, 30, 50, 80)
 _LONGEST = 4.0  # standard deviations of a step that counts
 _CLIPPED = 4.0  # |step|²/2v: no single particle, which may be lost, decides over all
@@ -123,7 +118,8 @@ def common_motion(
 
 def _steps_of(fits: pd.DataFrame, ticks: IntArray | None) -> _Steps | None:
     """Gather the steps of all tracks; None where too few particles are seen at once."""
-    sound = fits["status"].eq(Status.OK).groupby(fits["track"]).transform("mean") > _SOUND
+    # a track of which half of the rows are not ok may be two halves of something else
+    sound = fits["status"].eq(Status.OK).groupby(fits["track"]).transform("mean") > 0.5
     good = fits.loc[sound & ~fits["status"].isin(NO_PLACE), ["track", "frame", "x_nm", "y_nm"]]
     good = good.sort_values(["track", "frame"])
     step = good.diff()
@@ -135,13 +131,13 @@ def _steps_of(fits: pd.DataFrame, ticks: IntArray | None) -> _Steps | None:
     variance = np.full(len(track), np.nan)
     for k in np.unique(track):
         mine = track == k
-        if mine.sum() >= _LEAST_STEPS:
+        if mine.sum() >= 20:  # tell how far a particle goes
             variance[mine] = np.median((xy[mine] ** 2).sum(axis=1)) / (2 * math.log(2))
     used = variance > 0
     numbers, count = np.unique(frame[used], return_counts=True)
     numbers = numbers[count >= FEWEST_PARTICLES]
     used &= np.isin(frame, numbers)
-    if len(numbers) < _LEAST_PAIRS:
+    if len(numbers) < 30:
         return None
     order = np.flatnonzero(used)[np.argsort(frame[used], kind="stable")]
     pair = np.searchsorted(numbers, frame[order]).astype(np.int64)
@@ -162,7 +158,8 @@ def _shared_steps(steps: _Steps, frame_rate_hz: float | None) -> Finding | None:
     product = both[0] + both[1] - own
     mean, error = product.mean(), product.std() / math.sqrt(len(product))
     common = float(product.sum() / (2 * pairs.sum()))  # variance along each axis
-    if mean < _SIGNIFICANT * error or common < LEAST_COMMON_SHARE * np.median(steps.variance):
+    # 5 standard errors
+    if mean < 5.0 * error or common < LEAST_COMMON_SHARE * np.median(steps.variance):
         return None
     by = ""
     if frame_rate_hz is not None:
@@ -190,7 +187,8 @@ def _jumps(steps: _Steps) -> list[tuple[int, Finding]]:
         most = np.maximum(most, gain)
         rest = (total - largest) * (1 - 1 / gap) - (particles - 1) * math.log(gap)
         others = np.maximum(others, rest)
-    found: BoolArray = (most > _UNLIKELY + math.log(len(total))) & (others > _OTHERS)
+    # 7.0 of log-likelihood without the farthest particle, which may be another
+    found: BoolArray = (most > _UNLIKELY + math.log(len(total))) & (others > 7.0)
     out = []
     for k in np.flatnonzero(found)[:3].tolist():
         number, gap = int(steps.numbers[k]), int(missing[k])
@@ -226,10 +224,6 @@ FILM_FRAMES = 40
 _OF_FILM = ("frame", "x_px", "y_px", "chi2_reduced")
 _PLACE = ("frame", "x_nm", "y_nm", "z_nm", "mass_kda")
 _ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this share
-_NAMED = 3  # of pairs of tracks that met, in a message
-_TRUNCATED = 0.01  # of D, that is lost with the steps that are too long to be linked
-_ENOUGH = 5.0  # steps of one axis: 4 in 10⁶ in the plane are longer
-_LEAST_ABSORPTION = 1e-6  # of a permittivity, where a refractive index says it all no more
 
 
 def judge_times(config: Config, frames: int, name: str) -> list[Finding]:
@@ -294,7 +288,7 @@ def tracks_of(
     met = tracks[tracks["nearest_nm"] < setup.near_nm]
     if len(met):
         values = {"limit_nm": setup.near_nm, "nearest_nm": float(met["nearest_nm"].min())}
-        found.insert(0, TRACKS_CROSS({**values, "tracks": listed(met["track"], _NAMED)}))
+        found.insert(0, TRACKS_CROSS({**values, "tracks": listed(met["track"], 3)}))
     if setup.change:
         found.insert(0, MASSES_CHANGE_TOGETHER({"percent": 100 * setup.change}))
     summary = {"tracks": len(tracks), "motion": _summary(tracks, setup)}
@@ -307,7 +301,8 @@ def track_setup(context: AnalysisContext, windows: Windows) -> TrackSetup:
     rows, columns = windows.after_e.shape
     matter = material(config.particle, config.optics.wavelength_nm)
     resolution_nm = config.optics.wavelength_nm / config.optics.na
-    absorbs = abs(matter.permittivity.imag) > _LEAST_ABSORPTION or matter.permittivity.real <= 0
+    # a refractive index describes a permittivity whose imaginary part is below 1e-6
+    absorbs = abs(matter.permittivity.imag) > 1e-6 or matter.permittivity.real <= 0
     return TrackSetup(
         frame_rate_hz=config.camera.frame_rate_hz,
         exposure_ms=config.camera.exposure_ms,
@@ -379,9 +374,11 @@ def cut_steps(tracks: pd.DataFrame, setup: TrackSetup, reach_nm: float) -> Findi
     step = 1e3 * float(np.sqrt(2 * d / setup.frame_rate_hz))
     ratio = reach_nm**2 / (2 * step**2)
     longer = float(np.exp(-ratio))
-    if ratio * longer / (1 - longer) < _TRUNCATED:
+    # 1 % of D is lost with the steps that are too long to be linked
+    if ratio * longer / (1 - longer) < 0.01:
         return None
-    values = {"step_nm": step, "reach_nm": reach_nm, "enough_nm": _ENOUGH * step}
+    # 4 in 10⁶ steps in the plane are longer than 5 times the step along an axis
+    values = {"step_nm": step, "reach_nm": reach_nm, "enough_nm": 5.0 * step}
     return STEPS_TOO_LONG({**values, "percent": 100 * longer})
 
 

@@ -20,8 +20,10 @@ from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis import fixed_height_warning
 from iscat_analysis.fitting.ranges import checked
+from iscat_analysis.records import silent
 from iscat_analysis.study import Movie
 from iscat_analysis.tracking.find import held_height_warning
+from iscat_analysis.tracking.frames import Recording
 
 STEP_NM, SIGMA_NM = 30.0, 5.0
 
@@ -86,10 +88,8 @@ def _said_of(config: Config, movie: Stack, flags: Sequence[str]) -> str | None:
     fits = pd.DataFrame({"frame": np.arange(len(flags)) % len(movie.counts), "flags": flags})
     camera = camera_from_config(config.camera, movie.shape[1:], movie.dtype)
     with ThreadPoolExecutor(1) as pool:
-        found = held_height_warning(
-            config, movie, camera, (0, len(movie.counts)), fits,
-            check=checked(movie, camera), pool=pool,
-        )  # fmt: skip
+        recording = Recording(movie, camera, checked(movie, camera), pool, silent)
+        found = held_height_warning(config, recording, (0, len(movie.counts)), fits)
     return None if found is None else found.text
 
 

@@ -23,9 +23,14 @@ from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.pipeline.kinds import kind_of
-from iscat_analysis.records import EVENT_COLUMNS, SEVERITY, Analysis, Status, Windows
+from iscat_analysis.records import EVENT_COLUMNS, SEVERITY, Analysis, Status, Windows, silent
 from iscat_analysis.study import Movie
-from iscat_analysis.tracking.frames import initial_background, load_field, tracking_context
+from iscat_analysis.tracking.frames import (
+    Recording,
+    initial_background,
+    load_field,
+    tracking_context,
+)
 
 SIDE = 48
 PLACES = ((14.3, 15.7), (33.2, 31.6))
@@ -212,9 +217,8 @@ def test_a_background_of_all_frames_is_their_mean_or_their_median(method: str) -
     context = tracking_context(config, counts.shape[1:], len(counts))
     with ThreadPoolExecutor(1) as pool:
         span = (0, len(counts))
-        field = load_field(
-            context, Stack(counts), camera, span, lambda *_: None, pool, lambda *_: None
-        )
+        recording = Recording(Stack(counts), camera, lambda *_: None, pool, silent)
+        field = load_field(context, recording, span)
         ground = initial_background(config, field)
     light = counts * 8.0 / ground.power[:, None, None]
     middle = {"fixed": np.mean, "median": np.median}[method](light, axis=0)

@@ -33,6 +33,7 @@ from iscat_analysis.tracking.frames import (
     MOST_DRIFT_OVER_COUNTING,
     SHORTEST,
     Plan,
+    Recording,
     drift_over_counting,
     follow_light,
     load_field,
@@ -306,10 +307,8 @@ def _whole(counts: np.ndarray, config: Config) -> tuple[pd.DataFrame, pd.DataFra
     stack, camera = Stack(counts), Camera(gain_e_per_adu=GAIN)
     context = tracking_context(config, (counts.shape[1], counts.shape[2]), len(counts))
     with threads(2) as pool:
-        moving = find_rows_and_background(
-            context, stack, camera, (0, len(counts)),
-            check=_unchecked, pool=pool, progress=lambda *_: None,
-        )  # fmt: skip
+        recording = Recording(stack, camera, _unchecked, pool, _untold)
+        moving = find_rows_and_background(context, recording, (0, len(counts)))
     inside = moving.field.holds(moving.rows.theta)
     table = table_of_tracks(
         moving_table(context, moving, 0), moving.rows.track, inside, config.track.min_frames,
@@ -336,7 +335,8 @@ def test_frames_are_kept_as_they_are_stored_where_one_gain_is_theirs(
     context = tracking_context(_config(), (24, 24), len(counts))
     electrons = camera.to_electrons(counts[4:])
     with threads(2) as pool:
-        field = load_field(context, Stack(counts), camera, (4, 30), _unchecked, pool, _untold)
+        recording = Recording(Stack(counts), camera, _unchecked, pool, _untold)
+        field = load_field(context, recording, (4, 30))
         total, totals = field.total_e, field.frame_totals
     assert field.exposures.counts.dtype == kept
     np.testing.assert_allclose(field.exposures.electrons(slice(None)), electrons, rtol=1e-6)
@@ -429,7 +429,7 @@ def test_an_interrupted_run_resumes_to_the_same_result(
     real = tracking_module.analyse_block
 
     def counted(*arguments: Any, **named: Any) -> Block:
-        calls.append(arguments[3])
+        calls.append(arguments[2])
         return real(*arguments, **named)
 
     monkeypatch.setattr(tracking_module, "analyse_block", counted)
