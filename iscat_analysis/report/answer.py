@@ -53,9 +53,6 @@ from iscat_analysis.report.numbers import (
 )
 from iscat_analysis.units import count
 
-MOST_FLAGGED = 0.2
-"""Share of flagged rows above which no answer is given."""
-
 TRACK_HEADINGS: Mapping[str, tuple[str, str, str]] = {
     "mass": ("mass_kda", "sigma_mass_kda", "kDa"),
     "D": ("d_um2_s", "sigma_d_um2_s", "µm²/s"),
@@ -76,7 +73,7 @@ class RowKind:
     Attributes
     ----------
     noun, judged : str
-        What one is called, and those of which a fair sample is asked.
+        Name of a row, and of the rows that must be a fair sample.
     status : type
         Verdicts on them.
     begins, heading : str
@@ -397,7 +394,7 @@ def precision_of(analysis: Analysis, table: pd.DataFrame, name: str) -> Precisio
 def caution(table: pd.DataFrame, kind: RowKind = EVENTS_KIND) -> Finding | None:
     """Find that too many events, or tracks, are flagged for an answer."""
     rows = tally(table[table["status"] != kind.short])
-    if rows.flagged <= MOST_FLAGGED * rows.number:
+    if rows.flagged <= 0.2 * rows.number:  # else the others are a selection, and no sample
         return None
     commonest = kind.status(next(name for name in rows.status if name != Status.OK.value))
     which = f"{rows.flagged} of {rows.number} {kind.judged} are"
@@ -443,14 +440,14 @@ def headline(analysis: Analysis, table: pd.DataFrame) -> list[str]:
     lines = [*spread_lines(analysis, found), *not_a_mass(analysis)]
     judged = found if kind is EVENTS_KIND else tracks
     rows, flagged = tally(judged), caution(judged, kind)
-    said = [fact.text for fact in answers(analysis, found)] if flagged is None else []
+    parts = [fact.text for fact in answers(analysis, found)] if flagged is None else []
     ok = f"{rows.ok if rows.flagged else 'all'} of them ok."
     if kind is TRACKS_KIND:
         text = f"{count(rows.number, 'track')} of {positions}, {ok}"
         if flagged is not None:
             text += f" {sentence(flagged.text)}"
-        elif said:
-            text += f" Over tracks: {', '.join(each[:1].lower() + each[1:] for each in said)}."
+        elif parts:
+            text += f" Over tracks: {', '.join(each[:1].lower() + each[1:] for each in parts)}."
         return [text, *lines]
     if flagged is not None:
         return [sentence(flagged.text), *lines]
@@ -458,7 +455,7 @@ def headline(analysis: Analysis, table: pd.DataFrame) -> list[str]:
     text = (
         "One event, and it is ok."
         if rows.number == 1
-        else " ".join([text, *(f"{t}." for t in said)])
+        else " ".join([text, *(f"{t}." for t in parts)])
     )
     return [text, *_against_bounds(analysis, found), *lines]
 

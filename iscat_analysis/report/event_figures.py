@@ -58,7 +58,6 @@ _GREYS = mpl.colormaps["gray"]
 _NOTHING = 255  # of a palette: transparent
 _SHADES = 48  # of each scale of images and films: noise hides the steps
 _CLIP_SHADES = 24  # of a clip, of which a page holds hundreds
-_TRACE_INCHES = 2.1  # height of a drawn trace
 
 
 class EventDetail(NamedTuple):
@@ -269,7 +268,7 @@ def triptych(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:
     """Draw data, model and residual of one event, and its contrast against frame."""
     rows, columns = view.contrast.shape
     tall = 2.55 * float(np.clip(rows / columns, 0.3, 3.0))
-    below = 0.0 if view.trace is None else _TRACE_INCHES
+    below = 0.0 if view.trace is None else 2.1  # inches
     height = tall + 1.0 + below
     figure = new_figure(8.4, height, constrained=False)
     if view.trace is not None:

@@ -18,15 +18,13 @@ from iscat_analysis.inference.checks import truth_in
 from iscat_analysis.movie.text_tables import refuse_twice
 from iscat_analysis.reading import first_line, is_file, open_regular, read_json
 from iscat_analysis.records import EVENT_COLUMNS, FloatArray, Status, is_event, track_numbers
-from iscat_analysis.report.tables import CSV_DIGITS
+from iscat_analysis.report.tables import write_csv
 from iscat_analysis.units import count
 
 Layout = Literal["trackpy", "napari", "photomol", "picasso"]
 
 SUFFIXES = {"trackpy": ".csv", "napari": ".npy", "photomol": ".csv", "picasso": ".hdf5"}
 """Files that `export_result` writes; Picasso's has a second one, ``.yaml``, beside it."""
-
-_LARGEST_FRAME = 2**32
 
 
 @dataclass(frozen=True)
@@ -228,7 +226,7 @@ def _write(partial: Path, fits: pd.DataFrame, layout: Layout, tracked: bool, fol
         table = to_photomol(fits, masses=_calibrated(folder))
     else:
         table = to_trackpy(fits) if tracked else _trackpy(_events(fits))
-    table.to_csv(partial, index=False, float_format=f"%.{CSV_DIGITS}g")
+    write_csv(table, partial)
 
 
 def _write_locs(path: Path, locs: pd.DataFrame, info: dict[str, Any]) -> None:
@@ -326,7 +324,7 @@ def _checked(fits: pd.DataFrame) -> pd.DataFrame:
                 f"`fits`: holds in {name} what is no number ({first_line(error)}); give "
                 "`Result.table`"
             ) from None
-        whole = (values >= 0) & (values < _LARGEST_FRAME) & (values == np.floor(values))
+        whole = (values >= 0) & (values < 2**32) & (values == np.floor(values))
         if name in ("frame", "track", "event") and not (whole | np.isnan(values)).all():
             raise DataError(
                 f"`fits`: holds {values[~whole][0]:g} in {name}, which counts from 0; give "

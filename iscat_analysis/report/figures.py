@@ -447,8 +447,8 @@ def view_of(analysis: Analysis, event: int) -> EventView:
         if view.event == event:
             return view
     known = [view.event for view in analysis.views]
-    held = f"it has events {min(known)} to {max(known)}" if known else "no event was found"
-    raise DataError(f"{_movie(analysis)}: there is no event {event}; {held}")
+    numbered = f"it has events {min(known)} to {max(known)}" if known else "no event was found"
+    raise DataError(f"{_movie(analysis)}: there is no event {event}; {numbered}")
 
 
 def posterior_of(analysis: Analysis, event: int) -> PosteriorResult:

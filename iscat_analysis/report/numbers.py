@@ -17,8 +17,6 @@ LABELS = {"x_nm": "x", "y_nm": "y", "z_nm": "z", "mass_kda": "mass", "diameter_n
 UNITS = {"x_nm": "nm", "y_nm": "nm", "z_nm": "nm", "mass_kda": "kDa", "diameter_nm": "nm"}
 """Their units."""
 
-_SHORT_NAME = 28  # characters
-
 
 @dataclass(frozen=True)
 class Fact:
@@ -176,7 +174,7 @@ def link(page: Any, name: str) -> str:
     return Markup('<a href="{}">{}</a>').format(quote(page), name)
 
 
-def unbroken(words: Any, longest: int = _SHORT_NAME) -> Any:
+def unbroken(words: Any, longest: int = 28) -> Any:
     """Keep a short text on one line; a dash for none."""
     words = words or "—"
     if not isinstance(words, str) or len(words) > longest:

@@ -240,7 +240,7 @@ def _locked(target: Path, folder: Path) -> Iterator[bool]:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         before = _state_of_lock(path)
-        held = take(lock, 0)
+        locked = take(lock, 0)
     except Timeout:
         owner = _owner(path)
         who = f" (process {owner})" if owner else ""
@@ -254,16 +254,16 @@ def _locked(target: Path, folder: Path) -> Iterator[bool]:
         ) from None
     ours = before is None or before.st_size > 0 or not _is_still(path, before)
     try:
-        first = held and lock.lock_counter == 1
+        first = locked and lock.lock_counter == 1
         if first and ours:
             with unfinished(path):
                 yield first
         else:
             yield first
     finally:
-        if ours and (not held or lock.lock_counter == 1):
+        if ours and (not locked or lock.lock_counter == 1):
             path.unlink(missing_ok=True)  # before it is released: nobody waits for this file
-        if held:
+        if locked:
             lock.release()
 
 

@@ -163,7 +163,7 @@ def species_figure(found: Mapping[str, Any]) -> Figure | None:
             panels[0].axvline(rung["mass_kda"], color=GREY, lw=0.8, ls=":", zorder=0)
             place: Style = {"xycoords": ("data", "axes fraction"), "ha": "center"}
             panels[0].annotate(str(rung["n"]), (rung["mass_kda"], 1), va="bottom", **place)
-    panels[0].legend(loc="best")  # said, because without it Matplotlib warns where that is slow
+    panels[0].legend(loc="best")  # named, because Matplotlib warns where its own choice is slow
     return figure
 
 

@@ -44,7 +44,6 @@ MSD_PART = 4
 INDICES = (1.36, 1.40, 1.46, 1.52, 1.60)
 """Refractive indices whose lines are drawn, of spheres that do not absorb."""
 
-_LEAST_WIDTH = 0.012  # of an axis, of a track whose error would not be seen
 _UM2 = 1e6  # nm²
 
 
@@ -278,7 +277,7 @@ def _log_span(values: FloatArray, errors: FloatArray) -> tuple[float, float]:
 
 def _hills(grid: FloatArray, values: FloatArray, errors: FloatArray) -> FloatArray:
     """Give each track a normal curve, as wide as its error, shape (tracks, grid)."""
-    width = np.maximum(errors, _LEAST_WIDTH * (grid[-1] - grid[0]))[:, None]
+    width = np.maximum(errors, 0.012 * (grid[-1] - grid[0]))[:, None]  # else it is not visible
     return np.asarray(np.exp(-(((grid - values[:, None]) / width) ** 2) / 2) / width)
 
 
