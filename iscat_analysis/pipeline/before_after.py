@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import zip_longest
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -57,7 +57,6 @@ from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.landing.split_frames import field_repeats
 from iscat_analysis.movie import Stack
 from iscat_analysis.pipeline.kinds import Kind, Look, candidate_table, with_threshold
-from iscat_analysis.pipeline.stored import StoredResult
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     Candidate,
@@ -72,6 +71,9 @@ from iscat_analysis.records import (
 )
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
+
+if TYPE_CHECKING:
+    from iscat_analysis.pipeline.stored import StoredResult
 
 CHANGES = 4.0
 """Spread of the mass between parts of an event's frames over that of its light, beyond which it is

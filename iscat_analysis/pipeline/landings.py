@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -40,7 +40,6 @@ from iscat_analysis.landing.tasks import StepEvent, TaskBuilder, patch_of, trace
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.finish import reported_rows
 from iscat_analysis.pipeline.kinds import Kind, Look, candidate_table
-from iscat_analysis.pipeline.stored import StoredResult
 from iscat_analysis.records import (
     FRAME_COLUMN,
     Candidate,
@@ -66,6 +65,9 @@ from iscat_analysis.search.sliding import (
 )
 from iscat_analysis.search.templates import LARGEST_IMAGE
 from iscat_analysis.threads import threads
+
+if TYPE_CHECKING:
+    from iscat_analysis.pipeline.stored import StoredResult
 
 _SAME_PX = 2.0
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -25,7 +26,6 @@ from iscat_analysis.pipeline.before_after import (
     find_before_after,
 )
 from iscat_analysis.pipeline.kinds import Kind, Look, candidate_table, with_threshold
-from iscat_analysis.pipeline.stored import StoredResult
 from iscat_analysis.records import EventView, FloatArray, Windows, silent
 from iscat_analysis.threads import threads
 from iscat_analysis.tracking.blocks import row_view
@@ -43,6 +43,9 @@ from iscat_analysis.tracking.frames import (
 from iscat_analysis.tracking.rows import BackgroundEstimate, Localizations
 from iscat_analysis.tracking.search import search_frames
 from iscat_analysis.tracking.stages import blurred_rows
+
+if TYPE_CHECKING:
+    from iscat_analysis.pipeline.stored import StoredResult
 
 AROUND = 100
 """Frames that make the background of one frame in which particles move."""
