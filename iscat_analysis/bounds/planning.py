@@ -384,7 +384,7 @@ def effort(config: Config, goal: Goal) -> list[Effort]:
 def _effort(config: Config, goal: Goal, name: str, before: Callable[[int], int]) -> Effort:
     def bound(n_after: int) -> float:
         return _bound(
-            with_keys(config, bounds={"n_after": n_after, "n_before": before(n_after)}), goal
+            with_keys(config, {"bounds": {"n_after": n_after, "n_before": before(n_after)}}), goal
         )
 
     one = bound(1)
@@ -409,7 +409,7 @@ def _effort(config: Config, goal: Goal, name: str, before: Callable[[int], int])
             frames += step
         while frames > step and bound(frames - step) <= goal.value:
             frames -= step
-    reached = plan(with_keys(config, bounds={"n_after": frames, "n_before": before(frames)}))
+    reached = plan(with_keys(config, {"bounds": {"n_after": frames, "n_before": before(frames)}}))
     rate = config.camera.frame_rate_hz
     seconds = (frames + before(frames)) / rate if rate else None
     return Effort(name, before(frames), frames, seconds, reached.collected)
@@ -428,8 +428,8 @@ def budget(config: Config, parameter: str) -> list[Cost]:
     """Where the precision goes, from the light's own bound to this experiment's."""
     free = FREE_PARAMETERS[config.fit.mode]
     at = PARAMETERS.index(parameter)
-    quiet = with_keys(config, camera={"read_noise_e": 0.0}, bounds={"n_before": 0})
-    fine = with_keys(quiet, **_refined(quiet))
+    quiet = with_keys(config, {"camera": {"read_noise_e": 0.0}, "bounds": {"n_before": 0}})
+    fine = with_keys(quiet, _refined(quiet))
     ideal = plan(fine).bounds(PARAMETERS)
     steps = [
         ("quantum bound", float(ideal.qcrb[at])),
@@ -438,7 +438,7 @@ def budget(config: Config, parameter: str) -> list[Cost]:
     ]
     for cause, one in (
         ("pixelation", quiet),
-        ("finite background", with_keys(config, camera={"read_noise_e": 0.0})),
+        ("finite background", with_keys(config, {"camera": {"read_noise_e": 0.0}})),
         ("read noise", config),
     ):
         steps.append((cause, float(plan(one).bounds(free).crb_joint[at])))
@@ -461,7 +461,7 @@ def _refined(config: Config) -> Mapping[str, Mapping[str, Any]]:
     return _pixelated(config, pixel / split)
 
 
-def with_keys(config: Config, **sections: Mapping[str, Any]) -> Config:
+def with_keys(config: Config, sections: Mapping[str, Mapping[str, Any]]) -> Config:
     """Replace keys of sections of a configuration, which is checked again."""
     values = config.model_dump(exclude_none=True)
     for section, keys in sections.items():

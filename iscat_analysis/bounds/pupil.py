@@ -363,7 +363,7 @@ def _result(
     bound = _holevo(there, chosen)
     at = [PARAMETERS.index(name) for name in chosen]
     sigma, own = sigmas(there)
-    silent_camera = with_keys(best, camera={"read_noise_e": 0.0}, bounds={"n_before": 0})
+    silent_camera = with_keys(best, {"camera": {"read_noise_e": 0.0}, "bounds": {"n_before": 0}})
     quiet, _ = sigmas(plan(silent_camera))
     before, _ = sigmas(here)
     joint = FREE_PARAMETERS[config.fit.mode]

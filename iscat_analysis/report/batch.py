@@ -524,7 +524,7 @@ def _points(
 ) -> None:
     """Draw values and intervals of rows; `names` are the columns of value, lower and upper end."""
     value, low, high = (rows[name].to_numpy(float) for name in names)
-    whiskers(axes, x, value, (low, high), ms=3.5, ls="none", capsize=0, **style)
+    whiskers(axes, x, value, (low, high), style={"ms": 3.5, "ls": "none", "capsize": 0, **style})
 
 
 def _species(species: pd.DataFrame, label: str) -> Figure:

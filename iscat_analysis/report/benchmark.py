@@ -165,7 +165,7 @@ def render_benchmark(study: Mapping[str, Any], *, folder: Path | None = None) ->
         f"each mode, seed {study['seed']}"
     )
     return render_document(
-        "Estimators beside their bounds", subtitle, sections, footer=_footer(study)
+        "Estimators beside their bounds", subtitle, sections, frame={"footer": _footer(study)}
     )
 
 
@@ -305,7 +305,7 @@ def _draw_curve(axis: str, curve: Mapping[str, Any], axes: Axes, name: str) -> N
     _draw_bounds(axes, fine["at"], fine[name])
     ends = np.transpose([floats(pair) for pair in line["spread_ci95"]])
     style: Style = {"color": VERMILLION, "label": "spread"}
-    whiskers(axes, curve["at"], floats(line["spread"]), ends, **style)
+    whiskers(axes, curve["at"], floats(line["spread"]), ends, style=style)
     axes.set(xscale="log" if logarithmic else "linear", xlabel=label, ylabel="standard deviation")
     plain_log(axes, "y")
 
@@ -348,7 +348,9 @@ def render_challenge(document: Mapping[str, Any], *, folder: Path | None = None)
     about = document.get("challenge")
     blind = "truth withheld" if about and about["blind"] else "truth open"
     subtitle = f"version {about['version']}, {blind}" if about else "one's own simulation"
-    return render_document(document["title"], subtitle, sections, footer=_footer(document))
+    return render_document(
+        document["title"], subtitle, sections, frame={"footer": _footer(document)}
+    )
 
 
 def contest_parts(study: Mapping[str, Any]) -> dict[str, Any]:
@@ -652,7 +654,7 @@ def _draw_points(
     if np.isfinite(values).any():
         ends = np.transpose([floats(pair) for pair in line[f"{key}_ci95"]])
         mark: Style = {"fmt": _MARKERS[k % len(_MARKERS)], "color": _COLOURS[k % len(_COLOURS)]}
-        whiskers(axes, at, values, ends, **mark, lw=0.8, label=who)
+        whiskers(axes, at, values, ends, style={**mark, "lw": 0.8, "label": who})
 
 
 def _map_figure(found: Mapping[str, Any], names: Sequence[str]) -> Figure:
@@ -710,7 +712,7 @@ def _reached_figure(part: Mapping[str, Any]) -> Figure:
         at = np.arange(len(known))[::-1]
         values = floats(e["spread_over_crb"] for e in known)
         ends = np.reshape([floats(e["spread_over_crb_ci95"]) for e in known], (-1, 2)).T
-        whiskers(axes, at, values, ends, along="x", color=_COLOURS[0])
+        whiskers(axes, at, values, ends, along="x", style={"color": _COLOURS[0]})
         axes.axvline(1.0, color=INK, linewidth=1)
         axes.set_yticks(at, [e["who"] for e in known])
         axes.set(xscale="log", title=LABELS[name], xlabel="spread / CRB")

@@ -313,16 +313,19 @@ def write_paper(
             write_csv(table, building / name)
         drawn = publish(_paper_figures(curves, images, table, quantum, field_nm), building)
         bar = [("table-1", "Table 1"), *((f"figure-{n}", f"Figure {n}") for n in (2, 3, 4))]
+        frame = {
+            "kicker": "iscat bounds",
+            "nav": bar,
+            "footer": "30 nm gold, 517.5 nm, NA 1.3, oil and glass 1.5, water 1.33; "
+            "field of 4 × 4 µm.",
+        }
         page = render_document(
             "Dong et al. (2021), printed and exact",
             "Fundamental bounds on the precision of iSCAT, COBRI and dark-field microscopy, J. "
             "Phys. D 54, 394002: each number and each curve as its authors computed it, and as it "
             "comes out without the slips.",
             _sections(table, drawn),
-            kicker="iscat bounds",
-            nav=bar,
-            footer="30 nm gold, 517.5 nm, NA 1.3, oil and glass 1.5, water 1.33; "
-            "field of 4 × 4 µm.",
+            frame=frame,
         )
         (building / "comparison.html").write_text(page, encoding="utf-8")
     return folder

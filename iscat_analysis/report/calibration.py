@@ -193,7 +193,7 @@ def _camera_figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
         axes.plot(curve["mean_adu"], floats(curve["fit_adu2"]), color=INK, label="fit")
         variance, reach = floats(curve["variance_adu2"]), 1.96 * floats(curve["variance_se"])
         style: Style = {"ms": 3, "color": VERMILLION, "label": "pixels, 95 %"}
-        whiskers(axes, curve["mean_adu"], variance, around(variance, reach), **style)
+        whiskers(axes, curve["mean_adu"], variance, around(variance, reach), style=style)
         axes.set(xlabel="mean [counts]", ylabel="variance [counts²]")
         axes.legend()
         yield "transfer", figure
@@ -256,7 +256,7 @@ def _mass_figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     axes.plot(grid, line, color=INK, label="line, 95 %")
     axes.fill_between(grid, line - band, line + band, color=GREY, alpha=0.35, lw=0)
     style: Style = {"color": VERMILLION, "label": "standards, 95 %"}
-    whiskers(axes, masses, contrasts, around(contrasts, reach), **style)
+    whiskers(axes, masses, contrasts, around(contrasts, reach), style=style)
     axes.set(xlabel="mass [kDa]", ylabel="|contrast|")
     axes.legend()
     yield "standards", figure
@@ -349,7 +349,7 @@ def _optics_figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     figure, panels = row_of_panels(2, 3.1, 2.9)
     far, na = max(1.0, float(np.nanmax(np.abs(wavefront)))), pictures["na"]
     picture(panels[0], wavefront, na, (-far, far), "wavefront [nm]")
-    picture(panels[1], passed, na, (0.0, 1.0), "amplitude passed", cmap="cividis")
+    picture(panels[1], passed, na, (0.0, 1.0), "amplitude passed", style={"cmap": "cividis"})
     _name_axes(panels, "NA along x", "NA along y")
     yield "pupil", figure
     yield "p-values", _p_values(found["held_out"]["p_values"])
@@ -367,7 +367,7 @@ def _radial(pictures: Mapping[str, Any]) -> Figure:
     radius, mean, se = (np.array(pictures[k]) for k in ("radius_nm", "radial", "radial_se"))
     axes.plot(radius, pictures["radial_model"], color=BLUE, label="model")
     style: Style = {"fmt": ".", "color": VERMILLION, "label": "measured, 95 %"}
-    whiskers(axes, radius, mean, around(mean, 1.96 * se), **style)
+    whiskers(axes, radius, mean, around(mean, 1.96 * se), style=style)
     axes.set(xlabel="distance [nm]", ylabel="contrast")
     axes.legend()
     return figure
@@ -444,7 +444,9 @@ def _template_figures(found: Mapping[str, Any], template: Template) -> Iterator[
     figure, panels = row_of_panels(2, 3.1, 2.9)
     picture(panels[0], template.contrast, half, (-1.0, 1.0), "contrast")
     top = float(template.sigma.max())
-    picture(panels[1], template.sigma, half, (0.0, top), "standard deviation", cmap="cividis")
+    picture(
+        panels[1], template.sigma, half, (0.0, top), "standard deviation", style={"cmap": "cividis"}
+    )
     _name_axes(panels, "x [µm]", "y [µm]")
     yield "template", figure
     yield "held-out", _p_values(found["held_out"]["p_values"])

@@ -88,12 +88,14 @@ def overview(analysis: Analysis, table: pd.DataFrame) -> Figure:
     # Matplotlib leaves the pixels of small images to the browser, and averages those of large ones.
     how = "none" if max(image.shape) <= 640 else "antialiased"
     figure, axes, shown, per_inch = field_figure(
-        image, analysis.scheme, analysis.pixel_size_nm, interpolation=how
+        image, analysis.scheme, analysis.pixel_size_nm, style={"interpolation": how}
     )
     unit = analysis.scheme_kind.image_unit
     figure.colorbar(shown, ax=axes, label=unit, fraction=0.05, pad=0.02)
     x, y = table["x_px"].to_numpy(float), table["y_px"].to_numpy(float)
-    points(axes, x, y, np.isfinite(x), "o", mfc="none", mec="#F0E442", ms=11, mew=1)
+    points(
+        axes, x, y, np.isfinite(x), "o", style={"mfc": "none", "mec": "#F0E442", "ms": 11, "mew": 1}
+    )
     first = table.drop_duplicates("event")[["event", "x_px", "y_px"]].dropna()
     _number(axes, first.to_numpy(float), np.array(per_inch), image.shape)
     return figure
@@ -172,9 +174,18 @@ def timeline(analysis: Analysis, table: pd.DataFrame) -> Figure:
             below.fill_between((start, stop), 100 * (1 - share), color=VERMILLION, lw=0)
         below.set(ylim=(0, 100), ylabel="hidden [%]", xlabel="frame")
     frames, good = table["frame"].to_numpy(float), _is_ok(table)
-    points(axes, frames, values, good, "o", color=BLUE, ms=3.5, alpha=0.8, mew=0, label="ok")
+    points(
+        axes,
+        frames,
+        values,
+        good,
+        "o",
+        style={"color": BLUE, "ms": 3.5, "alpha": 0.8, "mew": 0, "label": "ok"},
+    )
     if not good.all():
-        points(axes, frames, values, ~good, "x", color=PURPLE, ms=4, label="flagged")
+        points(
+            axes, frames, values, ~good, "x", style={"color": PURPLE, "ms": 4, "label": "flagged"}
+        )
         legend(figure)
     axes.set(xlabel="" if spans else "frame", ylabel=main.axis)
     axes.xaxis.set_major_locator(MaxNLocator(7, integer=True))
@@ -205,12 +216,28 @@ def precision(analysis: Analysis, table: pd.DataFrame) -> Figure:
             continue
         ends = np.array([crb[usable].min() / 1.15, crb[usable].max() * 1.15])
         axes.plot(ends, ends, color=INK, lw=1.2, label="CRB")
-        dots: Style = {"linked": linked, "ms": 3.5, "alpha": 0.7, "mew": 0}
-        points(axes, crb, qcrb, usable, "s", color=BLUE, label="QCRB", **dots)
-        points(axes, crb, sigma, usable & good, "o", color=VERMILLION, label="σ", **dots)
+        dots: Style = {"ms": 3.5, "alpha": 0.7, "mew": 0}
+        points(
+            axes,
+            crb,
+            qcrb,
+            usable,
+            "s",
+            linked=linked,
+            style={"color": BLUE, "label": "QCRB", **dots},
+        )
+        points(
+            axes,
+            crb,
+            sigma,
+            usable & good,
+            "o",
+            linked=linked,
+            style={"color": VERMILLION, "label": "σ", **dots},
+        )
         if (bad := usable & ~good).any():
-            cross: Style = {"linked": linked, "ms": 4, "color": PURPLE, "label": "σ, flagged"}
-            points(axes, crb, sigma, bad, "x", **cross)
+            cross: Style = {"ms": 4, "color": PURPLE, "label": "σ, flagged"}
+            points(axes, crb, sigma, bad, "x", linked=linked, style=cross)
         axes.set_xlim(*ends)
         plain_log(axes, "x", "y")
     legend(figure)
@@ -251,7 +278,7 @@ def _draw_windows(axes: Axes, part: Mapping[str, Any], window: float) -> None:
         axes.plot(lengths, part["empty_over_crb"][1:], "s", color=GREY, ms=4, label="no particle")
     ends = np.array(part["repeat_over_crb_ci95"])[:, None]
     mark: Style = {"fmt": "D", "color": VERMILLION, "ms": 5, "label": "estimates"}
-    whiskers(axes, [window], [part["repeat_over_crb"]], ends, **mark)
+    whiskers(axes, [window], [part["repeat_over_crb"]], ends, style=mark)
     plain_log(axes, "x")
     axes.set_xlabel("frames averaged")
 
@@ -268,7 +295,7 @@ def _draw_frames(axes: Axes, part: Mapping[str, Any]) -> None:
 def _draw_curve(axes: Axes, part: Mapping[str, Any], mark: str, color: str, label: str) -> None:
     spread, error = (floats(part[f"repeat_over_crb_by_frames{end}"]) for end in ("", "_se"))
     style: Style = {"fmt": mark, "color": color, "label": label, "ms": 3.5}
-    whiskers(axes, part["repeat_frames"], spread, around(spread, error), **style)
+    whiskers(axes, part["repeat_frames"], spread, around(spread, error), style=style)
 
 
 def budget(analysis: Analysis) -> Figure | None:

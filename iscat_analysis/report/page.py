@@ -44,10 +44,18 @@ class Section:
     short: str = ""
 
 
-def render_document(title: str, subtitle: str, sections: Sequence[Section], **shown: Any) -> str:
-    """Fill a page of sections; `shown` replaces what the frame of a page says by itself."""
+def render_document(
+    title: str, subtitle: str, sections: Sequence[Section], frame: Mapping[str, Any] | None = None
+) -> str:
+    """Fill a page of sections; `frame` replaces what the frame of a page says by itself."""
     nav = [(part.id, part.short or part.title) for part in sections]
-    about = {"title": title, "subtitle": subtitle, "sections": sections, "nav": nav, **shown}
+    about = {
+        "title": title,
+        "subtitle": subtitle,
+        "sections": sections,
+        "nav": nav,
+        **(frame or {}),
+    }
     return render_page("document.html", about)
 
 

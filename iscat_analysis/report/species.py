@@ -227,7 +227,7 @@ def sizes_figure(found: Mapping[str, Any]) -> Figure:
             np.interp(middle, diameter, model) / 2,
             [[middle / spread], [middle * spread]],
         )
-        whiskers(axes, [height], [middle], ends, along="x", color=INK, capsize=3)
+        whiskers(axes, [height], [middle], ends, along="x", style={"color": INK, "capsize": 3})
     axes.set(xlabel="diameter [nm]", ylabel=f"spheres per {width:g} nm", ylim=(0, None))
     axes.legend(loc="best")
     return figure
@@ -276,7 +276,14 @@ def _intervals(
         at, low, high = (floats(row[name] for row in rows) for name in names)
         places = np.arange(len(rows)) + 0.6 * ((i + 0.5) / kinds - 0.5)
         name = f"{number(rows[0]['mass_kda'])} kDa"
-        whiskers(axes, places, at, (low, high), along="x", ms=3.5, color=colour, label=name)
+        whiskers(
+            axes,
+            places,
+            at,
+            (low, high),
+            along="x",
+            style={"ms": 3.5, "color": colour, "label": name},
+        )
     axes.axvline(0, color=GREY, lw=0.8)
     axes.set(xlabel=f"{label}, 95 %", ylim=(len(pairs) - 0.5, -0.5))
     if len(pairs) <= _NAMED:
@@ -304,7 +311,7 @@ def binding_figure(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     for value in np.unique(at):  # replicates beside each other
         same = np.flatnonzero(at == value)
         side[same] = 1 + 0.06 * (np.arange(same.size) - (same.size - 1) / 2)
-    whiskers(left, at * side, share, (low, high), color=BLUE, label="tables, 95 %")
+    whiskers(left, at * side, share, (low, high), style={"color": BLUE, "label": "tables, 95 %"})
     line: Style = {"color": VERMILLION, "label": "equilibrium"}
     if dimer:
         left.plot(found["curve"]["concentration_nm"], found["curve"]["complexes"], **line)

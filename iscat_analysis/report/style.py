@@ -204,7 +204,7 @@ def points(
     mark: str = "o",
     *,
     linked: bool = True,
-    **style: Any,
+    style: Style | None = None,
 ) -> None:
     """Draw points that know the rows of the page's table that they stand for.
 
@@ -212,7 +212,7 @@ def points(
     `linked`.
     """
     at = np.flatnonzero(rows & np.isfinite(x) & np.isfinite(y))
-    (line,) = axes.plot(x[at], y[at], mark, ls="none", **style)
+    (line,) = axes.plot(x[at], y[at], mark, ls="none", **(style or {}))
     if at.size > 800:
         line.set_rasterized(True)
     elif linked:
@@ -220,14 +220,14 @@ def points(
 
 
 def whiskers(
-    axes: Axes, at: Any, values: Any, ends: Any, *, along: str = "y", **style: Any
+    axes: Axes, at: Any, values: Any, ends: Any, *, along: str = "y", style: Style | None = None
 ) -> None:
     """Draw values with their intervals along an axis; `ends` are all lower and all upper ends."""
     values = np.asarray(values, dtype=float)
     low, high = np.asarray(ends, dtype=float)
     reach = np.nan_to_num(np.maximum([values - low, high - values], 0.0))
     x, y = (at, values) if along == "y" else (values, at)
-    how: Style = {"fmt": "o", "ms": 4, "lw": 1, f"{along}err": reach, **style}
+    how: Style = {"fmt": "o", "ms": 4, "lw": 1, f"{along}err": reach, **(style or {})}
     axes.errorbar(x, y, **how)
 
 
@@ -238,12 +238,19 @@ def around(values: Any, reach: Any) -> tuple[FloatArray, FloatArray]:
 
 
 def picture(
-    axes: Axes, image: Any, half: float, limits: tuple[float, float], title: str, **style: Any
+    axes: Axes,
+    image: Any,
+    half: float,
+    limits: tuple[float, float],
+    title: str,
+    style: Style | None = None,
 ) -> None:
     """Draw an image whose half side is `half`, with its scale."""
     low, high = limits
     extent = (-half, half, half, -half)
-    shown = axes.imshow(image, vmin=low, vmax=high, extent=extent, **{"cmap": "RdBu_r", **style})
+    shown = axes.imshow(
+        image, vmin=low, vmax=high, extent=extent, **{"cmap": "RdBu_r", **(style or {})}
+    )
     axes.set_title(title)
     if (figure := axes.get_figure(root=True)) is not None:
         figure.colorbar(shown, ax=axes, shrink=0.8)
@@ -274,7 +281,12 @@ def scale_bar(axes: Axes, columns: int, rows: int, pixel_size_nm: float) -> None
 
 
 def field_figure(
-    image: FloatArray, scheme: str, pixel_size_nm: float, *, bright: float = 1.0, **style: Any
+    image: FloatArray,
+    scheme: str,
+    pixel_size_nm: float,
+    *,
+    bright: float = 1.0,
+    style: Style | None = None,
 ) -> tuple[Figure, Axes, AxesImage, tuple[float, float]]:
     """Draw a field of view; give pixels to an inch along x and y too.
 
@@ -296,7 +308,7 @@ def field_figure(
     low, high = display_range([image], scheme)
     shown = axes.imshow(
         image, cmap="gray", vmin=bright * low, vmax=bright * high,
-        aspect=per_inch[0] / per_inch[1], **style,
+        aspect=per_inch[0] / per_inch[1], **(style or {}),
     )  # fmt: skip
     scale_bar(axes, columns, rows, pixel_size_nm)
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xlabel="x [px]", ylabel="y [px]")

@@ -112,7 +112,11 @@ def trajectories(analysis: Analysis, fits: pd.DataFrame) -> Figure:
     tracks = tracks_of(analysis)
     image = np.asarray(analysis.ratio_image, float)
     figure, axes, _, _ = field_figure(
-        image, analysis.scheme, analysis.pixel_size_nm, bright=2.0, interpolation="antialiased"
+        image,
+        analysis.scheme,
+        analysis.pixel_size_nm,
+        bright=2.0,
+        style={"interpolation": "antialiased"},
     )
     paths = dict(iter(fits.sort_values("frame").groupby(track_numbers(fits))))
     lines = [paths[track][["x_px", "y_px"]].to_numpy(float) for track in tracks["track"]]
@@ -121,7 +125,7 @@ def trajectories(analysis: Analysis, fits: pd.DataFrame) -> Figure:
     axes.add_collection(drawn)
     starts = np.array([line[0] for line in lines]).reshape(-1, 2)
     every = np.ones(len(tracks), dtype=bool)
-    points(axes, starts[:, 0], starts[:, 1], every, mfc="none", mec="white", ms=5)
+    points(axes, starts[:, 0], starts[:, 1], every, style={"mfc": "none", "mec": "white", "ms": 5})
     _scale_beside(figure, axes, analysis)
     return figure
 
@@ -151,7 +155,7 @@ def mass_d(analysis: Analysis) -> Figure:
             style: Style = {"ls": "none", "elinewidth": 0.6, "alpha": 0.6, "color": color}
             axes.errorbar(mass[rows], d[rows], _bars(tracks, rows), sigma[rows], **style)
         if rows.any():
-            points(axes, mass, d, rows, color=color, ms=3, mew=0, label=mark)
+            points(axes, mass, d, rows, style={"color": color, "ms": 3, "mew": 0, "label": mark})
     if (usable & ~good).any():
         legend(figure)
     axes.set(xlim=x_ends, ylim=y_ends, xlabel=track_quantity(analysis).axis, ylabel="D [µm²/s]")
@@ -191,7 +195,7 @@ def distributions(analysis: Analysis) -> Figure:
                 bars = _bars(tracks, rows) if log else error[rows]
                 below.errorbar(value[rows], rank[rows], xerr=bars, **style)
             if rows.any():
-                points(below, value, rank, rows, color=color, ms=2.5, mew=0)
+                points(below, value, rank, rows, style={"color": color, "ms": 2.5, "mew": 0})
         above.set(ylim=(0, None))
         above.spines.left.set_visible(False)
         below.spines.left.set_visible(False)
