@@ -185,23 +185,23 @@ def bounds_report(config: Config) -> dict[str, Any]:
     per_photon: dict[str, dict[str, float]] = {}
     actual: dict[str, dict[str, float]] = {}
 
-    def put(kind: str, values: FloatArray, root: float) -> None:
-        """Add bounds as they are, and per photon of a number whose square root is given."""
+    def put(kind: str, values: FloatArray, of_one: FloatArray) -> None:
+        """Add bounds as they are, and per photon."""
         actual[kind] = _named(PARAMETERS, values)
-        per_photon[kind] = _named(NAMES, values * to_rel * root)
+        per_photon[kind] = _named(NAMES, of_one * to_rel)
 
-    put("crb_single", whole.crb_single, root_camera)
-    put("crb_joint", joint.crb_joint, root_camera)
+    put("crb_single", whole.crb_single, whole.crb_single * root_camera)
+    put("crb_joint", joint.crb_joint, joint.crb_joint * root_camera)
     for kind, values in (
         ("qcrb", single), ("qcrb_joint", joint_bounds), ("qcrb_dong2021", paper)
     ):  # fmt: skip
-        put(kind, values * per_step / root_light, root_light)
+        put(kind, values * per_step / root_light, values * per_step)
     losses = {}
     if config.optics.analyzer or config.optics.mask_na:
         share = transmitted_over_collected(model, z_nm)
         passed, _ = quantum_bounds(quantum_information(model, z_nm, light="transmitted"))
         root = root_light * math.sqrt(share)
-        put("qcrb_transmitted", passed * per_step / root, root)
+        put("qcrb_transmitted", passed * per_step / root, passed * per_step)
         losses = {"transmitted_over_collected": share}
     if not model.rho:
         alone = z_nm_phase_free(model, z_nm)

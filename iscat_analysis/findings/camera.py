@@ -6,7 +6,7 @@ from iscat_analysis.findings.registry import Severity, define
 
 # ---- numbers of the camera -------------------------------------------------------------------
 
-CAMERA_NUMBERS = define("camera-numbers", Severity.NOTE, "camera: {text}")
+CAMERA_NUMBERS = define("camera-numbers", Severity.NOTE, "{text}")
 GAIN_ASSUMED = define(
     "gain-assumed",
     Severity.CAUTION,

@@ -81,7 +81,7 @@ MASSES_CHANGE = define(
 )
 SPREAD_NOT_MEASURED = define(
     "spread-not-measured",
-    Severity.NOTE,
+    Severity.CAUTION,
     'fit.sigma = "measured" has no effect: the spread is not measured where the background is '
     "learnt with the tracks, and σ is that of the likelihood",
 )

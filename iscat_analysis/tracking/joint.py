@@ -143,7 +143,11 @@ def fit_jointly(
 ) -> tuple[Localizations, BackgroundEstimate, BoolArray]:
     """Fit rows and background in turn until neither changes."""
     sigma = 1 / np.sqrt(np.maximum(field.total_e, 1.0))
-    least = _ROUGH_STEP if coarse else _SETTLED
+    least, foreseen = _ROUGH_STEP if coarse else _SETTLED, _NEXT_STEP_SETTLED
+    # In few frames particles hardly leave their places: what lies between the background and a
+    # particle is then a step of many pixels together, which is small in each.
+    if field.frames < 60:
+        turns, least, foreseen = 5 * turns, least / 10, 0.0
     largest, length, change, damping = 0.0, np.inf, 0.0, _DAMPING
     done, step = np.ones(len(rows.frame), dtype=bool), np.zeros(field.used.shape)
     for turn in range(turns):
@@ -168,7 +172,7 @@ def fit_jointly(
         if change < _NEAR_STEP and largest > _FAR_STEP and not coarse:
             field.draw_anew()
             largest = change
-        elif change < least or change**2 < _NEXT_STEP_SETTLED * before:
+        elif change < least or change**2 < foreseen * before:
             break
     if follow_level:
         rows = field.followed(rows, step)

@@ -55,6 +55,7 @@ from iscat_analysis.tracking.linking import (
     mean_square,
     meeting,
     numbered,
+    seen,
     shares_mass,
     trimmed,
     typical,
@@ -370,8 +371,18 @@ def settle(task: Task, state: State) -> State:
 
 
 def refine(task: Task, state: State) -> State:
-    """Fit rows and background until neither changes."""
-    return task.fitted(_restored(task, state), coarse=False)
+    """Fit rows and background until neither changes, and once more without what is no track.
+
+    The rings of others, drawn far out by then, may explain a track.
+    """
+    state = task.fitted(_restored(task, state), coarse=False)
+    there = seen(task.context, state.rows)
+    if there.all():
+        return state
+    rows = state.rows.only(there[state.rows.track])
+    rows = replace(rows, track=(np.cumsum(there) - 1)[rows.track])
+    left = replace(state, rows=rows, diffusion=state.diffusion[there])
+    return task.fitted(left, 1, coarse=False)
 
 
 def _restored(task: Task, state: State) -> State:

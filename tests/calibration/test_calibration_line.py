@@ -12,6 +12,7 @@ from scenes import make_config
 
 from iscat_analysis.config import Calibration, Config
 from iscat_analysis.diagnosis import sign_warning
+from iscat_analysis.findings import Finding
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.scale import MassScale
@@ -122,7 +123,9 @@ def test_the_user_is_told_of_contrasts_below_the_line(tmp_path: Path) -> None:
     assert any("they have less" in text for text in off.summary["warnings"])
 
 
-def _signed(negative: int, positive: int, *, flagged: int = 0, contrast: float = 5e-3) -> str:
+def _signed(
+    negative: int, positive: int, *, flagged: int = 0, contrast: float = 5e-3
+) -> Finding | None:
     """Ask of particles with masses of either sign, and some whose fits are poor."""
     mass = [-200.0] * negative + [200.0] * (positive + flagged)
     table = pd.DataFrame({
@@ -135,9 +138,12 @@ def _signed(negative: int, positive: int, *, flagged: int = 0, contrast: float =
 
 def test_nearly_all_particles_of_the_other_sign_are_told() -> None:
     told = _signed(9, 1, flagged=30)
-    assert told.startswith("9 of 10 particles have a negative mass")
-    assert "they brighten the image, and by calibration.gradient_per_kda" in told
-    assert "they darken the image" in _signed(9, 1, contrast=-5e-3)
+    assert told is not None
+    assert "9 of 10 particles have a negative mass" in told.text
+    assert "they brighten the image, and by calibration.gradient_per_kda" in told.text
+    dark = _signed(9, 1, contrast=-5e-3)
+    assert dark is not None
+    assert "they darken the image" in dark.text
 
 
 def test_particles_that_may_leave_are_not_told() -> None:

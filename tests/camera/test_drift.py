@@ -253,7 +253,7 @@ def test_a_region_sees_what_the_field_sees() -> None:
     region = Region((16, 48), (14, 46))
     local = pattern.local(region, edge)
     windows = slice(edge - WINDOW, edge), slice(edge, edge + WINDOW)
-    before, after = (pattern.seen(local, window) for window in windows)
+    before, after = (local.seen(window) for window in windows)
     field = 1 + pattern.contrast[j][region.slices]
     ratio = after / before / field
     noise = np.sqrt(2 / (WINDOW * 4e4))

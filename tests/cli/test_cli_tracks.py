@@ -104,7 +104,7 @@ def test_without_a_frame_rate_there_are_tracks_and_one_line(
     assert _fit(folder, tmp_path / "out") == 0
     printed = capsys.readouterr()
     assert printed.err.count("camera.frame_rate_hz is not known") == 1
-    assert "as in camera.frame_rate_hz = 331.0" in printed.err
+    assert "as in --set camera.frame_rate_hz=331.0" in printed.err
     tracks = pd.read_csv(tmp_path / "out" / "tracks.csv")
     assert tracks["d_um2_s"].isna().all()
     assert tracks["mass_kda"].notna().all()

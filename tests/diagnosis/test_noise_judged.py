@@ -20,7 +20,7 @@ from iscat_analysis.fitting.context import make_context
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pieces.regions import SATURATION_NM
-from iscat_analysis.pipeline import analyse, before_after
+from iscat_analysis.pipeline import analyse, moving
 from iscat_analysis.records import Analysis
 from iscat_analysis.search.templates import ExcessNoise
 from iscat_analysis.tracking import blocks as block_store
@@ -126,7 +126,7 @@ def test_noise_that_fits_do_not_have_is_not_blamed_on_the_gain(
     """As rings seem to be, of which a wrong microscope leaves over something everywhere."""
     rings = Noise((OFF,), True, ExcessNoise(1.55, OFF.text))
     learnt = way == "track"
-    module = block_store if learnt else before_after
+    module = block_store if learnt else moving
     monkeypatch.setattr(module, "judge_beside", lambda *_: rings)
     counts = wandering if learnt else _movie(moves=True)
     assert not _gains(_analysed(counts, _learnt(GAIN) if learnt else _known("track", GAIN)))
