@@ -9,7 +9,7 @@ import pandas as pd
 from walkers import SETUP
 
 from iscat_analysis.config import config_to_toml, parse_config
-from iscat_analysis.findings import remark
+from iscat_analysis.findings.files import FILE_IMPLIES
 from iscat_analysis.records import (
     EVENT_COLUMNS,
     FREE_PARAMETERS,
@@ -175,7 +175,7 @@ def make_analysis(
             seed=1,
             started="2024-05-06T07:08:09+00:00",
         ),
-        findings=(remark("The TIFF says pixel_size_nm = 84.0, not 84.4: using 84.4."),),
+        findings=(FILE_IMPLIES({"text": "The TIFF says pixel_size_nm = 84.0, not 84.4."}),),
     )
 
 

@@ -10,7 +10,7 @@ UNEQUAL_HEIGHTS = define(
     "the particles are not equally high: {spread} where one height is held; their masses are wrong "
     "by what systematic_mass_kda says, and the fits of many are poor",
     'particle.height_nm = "auto" learns mean and spread and fits every height',
-    "howto/heights",
+    "explanation/errorbar",
 )
 
 _WIDER = (

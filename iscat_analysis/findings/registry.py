@@ -176,17 +176,3 @@ def warnings_in(findings: Iterable[Finding]) -> list[str]:
 def existing(findings: Iterable[Finding | None]) -> list[Finding]:
     """Leave out what was looked for and not found."""
     return [finding for finding in findings if finding is not None]
-
-
-_REMARK = define("remark", Severity.CAUTION, "{text}")
-_ASIDE = define("aside", Severity.NOTE, "{text}")
-
-
-def remark(text: str) -> Finding:
-    """Wrap a sentence that has no code yet."""
-    return _REMARK({"text": text})
-
-
-def aside(text: str) -> Finding:
-    """Wrap a note that has no code yet."""
-    return _ASIDE({"text": text})
