@@ -28,7 +28,7 @@ import numpy as np  # noqa: E402  # after the thread counts
 from _peer import peer_python  # noqa: E402
 
 from iscat_analysis.config import parse_config  # noqa: E402
-from iscat_analysis.inference.fit import (  # noqa: E402  # noqa: E402
+from iscat_analysis.inference.fit import (  # noqa: E402
     compile_kernels,
     fit_particle,
     parts_of,

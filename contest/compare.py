@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ import numpy as np
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ContrastError
 from iscat_analysis.executors import Executor
-from iscat_analysis.fitting import AnalysisContext
 from iscat_analysis.records import PARAMETERS, FloatArray, Progress, silent
 from iscat_analysis.study import (
     OF_DIPOLES,
@@ -193,13 +193,11 @@ def _points(config: Config, setting: Setting, count: int, seed: int) -> list[Poi
         stream = 1100 + len(found)
         found.append((axis, value, draw(one, count, seed=seed, stream=stream, **options)))
 
-    def made(context: AnalysisContext | None, which: str = mode, **options: Any) -> Setting:
-        return make_setting(config, which, context=context, **options)
-
-    faintest = made(setting.context, collected=PHOTONS[0])
+    made = partial(make_setting, config, mode, context=setting.context)
+    faintest = made(collected=PHOTONS[0])
     for photons in PHOTONS:
         z_nm = float(faintest.truth[2])
-        add("photons", photons, made(setting.context, collected=photons, z_nm=z_nm))
+        add("photons", photons, made(collected=photons, z_nm=z_nm))
     mass = make_setting(config, "mass")
     per_kda = float(detection_snr(mass.experiment_in_region, mass.truth[3:])[0]) / mass.truth[3]
     for snr in SNRS if math.isfinite(per_kda) else ():
@@ -208,7 +206,7 @@ def _points(config: Config, setting: Setting, count: int, seed: int) -> list[Poi
     low, high = config.fit.z_range_nm
     for share in HEIGHTS:
         z_nm = low + share * (high - low)
-        add("height", z_nm, made(setting.context, z_nm=z_nm))
+        add("height", z_nm, made(z_nm=z_nm))
     for change in FOCI_NM:
         if (one := _refocused(config, mode, change)) is not None:
             add("focus", optics.focus_nm + change, one)

@@ -15,8 +15,7 @@ from scipy.optimize import least_squares
 from scipy.signal import fftconvolve
 
 from iscat_analysis.config import Optics
-from iscat_analysis.inference import compile_kernels, fit_particle, parts_of
-from iscat_analysis.pieces import config_of, gather, psf
+from iscat_analysis.pieces import compile_kernels, config_of, fit_particle, gather, parts_of, psf
 from iscat_analysis.records import PARAMETERS, Candidate, FloatArray, Status
 from iscat_analysis.study import EstimatorSetup
 

@@ -21,6 +21,7 @@ region has its centre at (0, 0) nm.
 from __future__ import annotations
 
 from iscat_analysis.config import CameraConfig as Camera
+from iscat_analysis.inference.fit import compile_kernels, fit_particle, parts_of
 from iscat_analysis.pieces.counts import config_of, gather
 from iscat_analysis.pieces.limits import crb, psf, qcrb
 from iscat_analysis.pieces.regions import LogLikelihood, fit_rois, log_likelihood
@@ -29,12 +30,15 @@ from iscat_analysis.pieces.rods import fit_rods
 __all__ = [
     "Camera",
     "LogLikelihood",
+    "compile_kernels",
     "config_of",
     "crb",
+    "fit_particle",
     "fit_rods",
     "fit_rois",
     "gather",
     "log_likelihood",
+    "parts_of",
     "psf",
     "qcrb",
 ]
