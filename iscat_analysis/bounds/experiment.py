@@ -22,7 +22,7 @@ from iscat_analysis.bounds.quantum import (
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.findings import Finding
-from iscat_analysis.findings.bounds import COARSE_SAMPLING, SATURATED_PLAN
+from iscat_analysis.findings.setup import COARSE_SAMPLING, SATURATED_PLAN
 from iscat_analysis.inference.counts import asimov_conditional, asimov_poisson
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.models import TurningRod

@@ -29,7 +29,7 @@ from iscat_analysis.bounds.experiment import detector, expected_likelihood
 from iscat_analysis.config import Config, refuse_rod
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.findings import Finding
-from iscat_analysis.findings.bounds import FAINT_PICTURES, PICTURES_LEFT_OUT
+from iscat_analysis.findings.setup import FAINT_PICTURES, PICTURES_LEFT_OUT
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, ForwardModel, forward_model

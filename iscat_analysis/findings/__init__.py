@@ -1,57 +1,19 @@
 """What a movie, a table or a day tells beside its numbers: findings with a code, and what to do.
 
 A finding of each kind is defined once, in the module of what it is about, as photutils defines its
-flags: code, severity, sentence, remedy and page of the manual.  Whoever makes one gives the values
+flags: severity, code, sentence, remedy and page of the manual.  Whoever makes one gives the values
 that stand in the sentence.  One place prints them, the page sorts them by severity, and
 ``summary.json`` lists them with their values, so that a program can act on a code.
 """
 
-from __future__ import annotations
-
-from iscat_analysis.findings import (
-    bounds,
-    camera,
-    files,
-    optics,
-    particles,
-    results,
-    setup,
-    tables,
-    tracks,
-)
-from iscat_analysis.findings.registry import (
-    KINDS,
-    Finding,
-    FindingKind,
-    Findings,
-    Severity,
-    Value,
-    define,
-    existing,
-    printing,
-    unreported,
-    warnings_in,
-)
-
-__all__ = [
-    "KINDS",
-    "Finding",
-    "FindingKind",
-    "Findings",
-    "Severity",
-    "Value",
-    "bounds",
-    "camera",
-    "define",
-    "existing",
-    "files",
-    "optics",
-    "particles",
-    "printing",
-    "results",
-    "setup",
-    "tables",
-    "tracks",
-    "unreported",
-    "warnings_in",
-]  # fmt: skip
+from iscat_analysis.findings import camera, files, optics, particles, results, setup, tables, tracks  # noqa: F401
+from iscat_analysis.findings.registry import KINDS as KINDS
+from iscat_analysis.findings.registry import Finding as Finding
+from iscat_analysis.findings.registry import FindingKind as FindingKind
+from iscat_analysis.findings.registry import Findings as Findings
+from iscat_analysis.findings.registry import Severity as Severity
+from iscat_analysis.findings.registry import Value as Value
+from iscat_analysis.findings.registry import existing as existing
+from iscat_analysis.findings.registry import printing as printing
+from iscat_analysis.findings.registry import unreported as unreported
+from iscat_analysis.findings.registry import warnings_in as warnings_in

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from iscat_analysis.findings.registry import Severity, define
+from iscat_analysis.findings.registry import caution
 
-UNEQUAL_HEIGHTS = define(
+UNEQUAL_HEIGHTS = caution(
     "unequal-heights",
-    Severity.CAUTION,
     "the particles are not equally high: {spread} where one height is held; their masses are wrong "
     "by what systematic_mass_kda says, and the fits of many are poor",
     'particle.height_nm = "auto" learns mean and spread and fits every height',
@@ -21,16 +20,14 @@ _TOO_SMALL = (
     "; masses are too small, and rows are flagged extended where by more than half of σ{paired}"
 )
 
-LONG_IMAGES = define(
+LONG_IMAGES = caution(
     "long-images",
-    Severity.CAUTION,
     f"{_WIDER} and elongated, each in its own direction: particles have separate parts{_TOO_SMALL}",
     "fit.pairs = true gives the mass of two halves to rows with enough light",
 )
 
-WIDE_IMAGES = define(
+WIDE_IMAGES = caution(
     "wide-images",
-    Severity.CAUTION,
     f"{_WIDER}: particles wiggle or have separate parts, or wavelength, NA, focus or pixel size "
     "are not those configured, or the illumination is a cone, or pixels were averaged"
     f"{_TOO_SMALL}",
@@ -38,132 +35,112 @@ WIDE_IMAGES = define(
     "wiggle alike, or fit.pairs = true if they may be two halves",
 )
 
-FLUCTUATING_CONTRAST = define(
+FLUCTUATING_CONTRAST = caution(
     "fluctuating-contrast",
-    Severity.CAUTION,
     "contrasts fluctuate by {percent:.2g} ± {error_percent:.1g} % while particles are there, over "
     "some {frames:g} frames: masses have the error that remains in the mean over an event's "
     "frames, and sigma_mass_kda contains it",
 )
 
-SLOW_LANDINGS = define(
+SLOW_LANDINGS = caution(
     "slow-landings",
-    Severity.CAUTION,
     "the light of {rising} of {rows} steps rises over some {frames} frames, which are left out of "
     "their fits{unseen}",
 )
 
-UNEVEN_REFERENCE = define(
+UNEVEN_REFERENCE = caution(
     "uneven-reference",
-    Severity.CAUTION,
     "masses of the same particles differ over the field, as with a reference whose amplitude "
     "changes from the middle to the edge by {sizes}; this is in systematic_mass_kda",
     "if it is so, set optics.reference_tilt = [{x:+.4f}, {y:+.4f}], optics.reference_curvature = "
     "{curved:+.4f} and optics.field_px = [{field}]",
 )
 
-UNDERSTATED_SIGMA = define(
+UNDERSTATED_SIGMA = caution(
     "understated-sigma",
-    Severity.CAUTION,
     "σ is too small: the measured spread is {ratios} times the Cramér–Rao bound; {cause}",
     'fit.sigma = "measured" scales σ by it',
 )
 
-SCALED_SIGMA = define(
+SCALED_SIGMA = caution(
     "scaled-sigma",
-    Severity.CAUTION,
     "σ is scaled by the measured spread, {ratios} times the Cramér–Rao bound; {cause}",
 )
 
-LESS_NOISE = define(
+LESS_NOISE = caution(
     "less-noise",
-    Severity.CAUTION,
     "the measured spread is {ratios} times the Cramér–Rao bound: there is less noise than the "
     "camera's numbers say",
     "look at camera.gain_e_per_adu and camera.read_noise_e",
 )
 
-WIDE_SPECIES = define(
+WIDE_SPECIES = caution(
     "wide-species",
-    Severity.CAUTION,
     "the species {where} is wider than the budget explains: {percent:.2g} % beyond sigma (at least "
     "{least_percent:.2g} %), where the budget has {explained_percent:.2g} %: its particles differ, "
     "in height, focus over the field, shape or mass, or the light does; no error of a single row "
     "has that",
 )
 
-OPTICS_LEARNED = define(
+OPTICS_LEARNED = caution(
     "optics-learned",
-    Severity.CAUTION,
     "optics learned from the movie, instead of the configured ones: {headline}",
     page="howto/microscope",
 )
 
-OPTICS_AS_CONFIGURED = define(
+OPTICS_AS_CONFIGURED = caution(
     "optics-as-configured",
-    Severity.CAUTION,
     "{verdict}: {reason}; the analysis goes on as configured",
     page="howto/microscope",
 )
 
-OPTICS_NOT_LEARNED = define(
+OPTICS_NOT_LEARNED = caution(
     "optics-not-learned",
-    Severity.CAUTION,
     "the optics are not learned {reason}; the analysis goes on as configured",
     page="howto/microscope",
 )
 
-WRONG_SIGN = define(
+WRONG_SIGN = caution(
     "wrong-sign-of-contrast",
-    Severity.CAUTION,
     "at optics.focus_nm = {focus_nm:g} particles {shown}, where calibration.gradient_per_kda = "
     "{gradient_per_kda:g} has them {expected}",
     page="howto/focus",
 )
 
-TURNED_PHASE = define(
+TURNED_PHASE = caution(
     "turned-phase",
-    Severity.CAUTION,
     "the phase is half a turn from the one that was found, with which particles {found} the image: "
     "by calibration.gradient_per_kda they {expected} it; if the sign of the gradient is wrong, so "
     "is the sign of every mass",
 )
 
-ODD_APERTURE = define(
+ODD_APERTURE = caution(
     "odd-aperture",
-    Severity.CAUTION,
     "the numerical aperture differs by {difference:+.3f} from the configured one; pixels of about "
     "{pixel_nm:.1f} nm instead of {configured_nm:g} nm would explain the pictures as well",
     "check camera.pixel_size_nm",
 )
 
-UNTOLD_OPTICS = define(
+UNTOLD_OPTICS = caution(
     "untold-optics",
-    Severity.CAUTION,
     "the pictures tell little or nothing of {names}: what is configured and its usual error "
     "([uncertainty] optics) count, which is part of the error of all masses",
 )
 
-UNDECIDED_OPTICS = define(
+UNDECIDED_OPTICS = caution(
     "undecided-optics",
-    Severity.CAUTION,
     "the pictures do not tell {name} = true from false; it stays as configured (particles of "
     "higher contrast would tell)",
 )
 
-DROPPED_TERMS = define(
-    "dropped-terms", Severity.CAUTION, "{names} did not improve {pictures} and are 0"
+DROPPED_TERMS = caution("dropped-terms", "{names} did not improve {pictures} and are 0")
+
+PICTURES_LEFT_OUT = caution(
+    "contaminated-pictures", "{pictures} left out, because something else happened there"
 )
 
-PICTURES_LEFT_OUT = define(
-    "contaminated-pictures",
-    Severity.CAUTION,
-    "{pictures} left out, because something else happened there",
-)
-
-TWIN_OPTICS = define(
+TWIN_OPTICS = caution(
     "twin-optics",
-    Severity.CAUTION,
     "a twin with focus {focus_nm:.1f} nm, reference phase {phase_deg:.1f} deg and the even "
     "aberrations reversed makes the same pictures (log-likelihood {gap:.1f} {lower}); the "
     "configured side of focus was taken. A scan of the focus, particles at several heights or an "

@@ -2,86 +2,72 @@
 
 from __future__ import annotations
 
-from iscat_analysis.findings.registry import Severity, define
+from iscat_analysis.findings.registry import caution, note
 
-FRAMES_LEFT_OUT = define(
+FRAMES_LEFT_OUT = caution(
     "frames-left-out",
-    Severity.CAUTION,
     "{frames} {verb} dark, cut off, not finite or the same as the frame before (behind a shutter, "
     "dropped or stuck in the camera); left out, the other frames are used{lost}",
     page="howto/landing",
 )
-BRIGHTNESS_JUMPS = define(
+BRIGHTNESS_JUMPS = caution(
     "brightness-jumps",
-    Severity.CAUTION,
     "the brightness jumps at {frames} by up to {percent:+.0f} %",
     "it is divided out, but look at the laser and at events in these frames",
 )
-PATTERN_FOLLOWED = define(
+PATTERN_FOLLOWED = note(
     "pattern-motion-corrected",
-    Severity.NOTE,
     "the fixed pattern moved by {x_px:+.3f} pixels in x and {y_px:+.3f} in y; corrected, to "
     "±{error_px:.1g} pixels",
 )
-PATTERN_NOT_FOLLOWED = define(
+PATTERN_NOT_FOLLOWED = caution(
     "pattern-not-followed",
-    Severity.CAUTION,
     "no fixed pattern stands out of the noise in frames {frames}, so background.drift_correction "
     "has nothing to correct there",
 )
-PATTERN_MOVED = define(
+PATTERN_MOVED = caution(
     "landing-pattern-moved",
-    Severity.CAUTION,
     "the fixed pattern moved by {x_px:+.2f} pixels in x and {y_px:+.2f} in y; it is not corrected",
     "set background.drift_correction = true (shorter windows, background.window_frames, suffer "
     "less too)",
 )
-PARTLY_SEARCHED = define(
+PARTLY_SEARCHED = caution(
     "partly-searched",
-    Severity.CAUTION,
     "{share:.0%} of field and time were searched for particles with a signal-to-noise ratio of "
     "{snr:.0f}; what bright or ill-described particles left over hides the rest, most in frames "
     "{frames}",
     "numbers of particles and rates are corrected for it, but look at these frames",
 )
-POWER_ALWAYS_FOLLOWED = define(
+POWER_ALWAYS_FOLLOWED = note(
     "power-always-followed",
-    Severity.NOTE,
     "background.power_normalization = false has no effect on a landing movie: each frame is "
     "weighed by its own light",
 )
-HEIGHTS_LEARNED = define(
-    "heights-learned", Severity.NOTE, "{spread}, learned from {particles} particles"
-)
-HEIGHTS_NOT_LEARNED = define(
+HEIGHTS_LEARNED = note("heights-learned", "{spread}, learned from {particles} particles")
+HEIGHTS_NOT_LEARNED = caution(
     "heights-not-learned",
-    Severity.CAUTION,
     "the heights cannot be learned from so few or so faint particles: they are taken as "
     "{height_nm:g} ± {sd_nm:g} nm",
 )
-COMMON_HEIGHT_UNKNOWN = define(
+COMMON_HEIGHT_UNKNOWN = caution(
     "common-height-unknown",
-    Severity.CAUTION,
     "a common height and the focus are one number, and the focus was learned from the same "
     "particles: only their spread, {sd_nm:.1f} nm, is known, and the mean of {mean_nm:.1f} nm is "
     "where the learned optics put it",
 )
-INDEX_UNKNOWN = define(
+INDEX_UNKNOWN = caution(
     "index-unknown",
-    Severity.CAUTION,
     "the pictures of {number} of {spheres} do not tell diameter and index apart{best}; "
     "refractive_index is empty, and diameter_nm that of the configured index",
 )
-MASSES_CHANGE = define(
+MASSES_CHANGE = caution(
     "masses-change",
-    Severity.CAUTION,
     "the mass of {events} changes within the frames by more than {sigmas:g} times its error, "
     "flagged poor_fit: they land, leave or move there",
     "let background.frames end before they land and fit.frames begin after",
 )
-SPREAD_NOT_MEASURED = define(
+SPREAD_NOT_MEASURED = caution(
     "spread-not-measured",
-    Severity.CAUTION,
     'fit.sigma = "measured" has no effect: the spread is not measured where the background is '
     "learnt with the tracks, and σ is that of the likelihood",
 )

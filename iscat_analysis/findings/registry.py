@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
 from string import Formatter
 from typing import Any
 
@@ -71,13 +72,17 @@ KINDS: dict[str, FindingKind] = {}
 
 
 def define(
-    code: str, severity: Severity, sentence: str, remedy: str = "", page: str = ""
+    severity: Severity, code: str, sentence: str, remedy: str = "", page: str = ""
 ) -> FindingKind:
     """Register a kind of finding; a code that is taken is refused at import."""
     if code in KINDS:
         raise ValueError(f"the finding {code!r} is defined twice")
     KINDS[code] = FindingKind(code, severity, sentence, remedy, page)
     return KINDS[code]
+
+
+note, caution, fault = (partial(define, severity) for severity in Severity)
+"""Register a kind of finding of this severity."""
 
 
 @dataclass(frozen=True)

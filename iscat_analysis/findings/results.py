@@ -2,43 +2,38 @@
 
 from __future__ import annotations
 
-from iscat_analysis.findings.registry import Severity, define
+from iscat_analysis.findings.registry import caution
 
-NOT_A_MASS = define(
+NOT_A_MASS = caution(
     "not-a-mass",
-    Severity.CAUTION,
     "Not calibrated: mass_kda is on the model's own absolute scale, and an uncalibrated absolute "
     "scale is not a mass. What was measured are contrasts",
     "`iscat calibrate mass` makes masses of them",
     "howto/calibration",
 )
 
-MANY_FLAGGED = define(
+MANY_FLAGGED = caution(
     "many-flagged",
-    Severity.CAUTION,
     "{rows} flagged, so no median is given{rest}. The commonest reason is {reason}. {advice}",
 )
 
-MODEL_REJECTED = define(
+MODEL_REJECTED = caution(
     "model-rejected",
-    Severity.CAUTION,
     "The model is rejected: {poor} of {fits} fits have a p-value below {level:g}, where {chance} "
     "would by chance. Errors of the model, such as a wrong focus, aperture or pixel size, are not "
     "in σ, and in the spread only as rings left over of other particles; they show in how far the "
     "species are wider than σ",
 )
 
-NOTHING_FOUND = define(
+NOTHING_FOUND = caution(
     "nothing-found",
-    Severity.CAUTION,
     "Nothing was found in this movie that stands out from its noise",
     "if particles can be seen by eye, look at the field image and the light of the frames below, "
     "then at detection.polarity, detection.false_alarms_per_movie and the two frame ranges",
 )
 
-NO_TRACK = define(
+NO_TRACK = caution(
     "no-track",
-    Severity.CAUTION,
     "{positions}, and no particle was followed for track.min_frames",
     "look at the field image, at track.max_step_nm, which is the farthest a particle goes between "
     "frames, and at detection.false_alarms_per_movie",

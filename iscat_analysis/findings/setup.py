@@ -1,36 +1,60 @@
-"""The configuration: where it is from, and what a study of it leaves out."""
+"""The configuration: where it is from, and what its study or a planned experiment leaves out."""
 
 from __future__ import annotations
 
-from iscat_analysis.findings.registry import Severity, define
+from iscat_analysis.findings.registry import caution, fault, note
 
-CONFIGURATION_MERGED = define(
+CONFIGURATION_MERGED = note(
     "configuration-merged",
-    Severity.NOTE,
     "the configuration is {first}, with the keys of {others}",
     page="reference/configuration",
 )
-CONFIGURATION_BESIDE = define(
+CONFIGURATION_BESIDE = note(
     "configuration-beside",
-    Severity.NOTE,
     "the configuration is {path}, which lies beside the movie",
     page="howto/tiff",
 )
-LIGHT_HELD = define(
-    "light-held",
-    Severity.NOTE,
-    "the light on the particle is held: bounds.photons_per_pixel follows {axis}",
+LIGHT_HELD = note(
+    "light-held", "the light on the particle is held: bounds.photons_per_pixel follows {axis}"
 )
-OFFSET_LEFT_OUT = define(
+OFFSET_LEFT_OUT = caution(
     "offset-left-out",
-    Severity.CAUTION,
     "calibration.offset is left out, because it belongs to the configured optics: σ of the mass is "
     "that of a mass proportional to the field",
 )
-AMBIGUOUS_FITS = define(
+AMBIGUOUS_FITS = caution(
     "ambiguous-fits",
-    Severity.CAUTION,
     "mode {mode}: {ambiguous} of {trials} fits have the status {status} and are left out of bias "
     "and spread: several {several} describe the pixels about as well",
     "use more photons or frames (bounds.photons_per_pixel, bounds.n_after), or a narrower {key}",
+)
+
+SATURATED_PLAN = fault(
+    "saturated-plan",
+    "the brightest pixel expects {peak_e:.3g} e per frame, above camera.well_depth_e = "
+    "{well_depth_e:.3g}",
+    "lower bounds.photons_per_pixel",
+    "howto/planning",
+)
+
+COARSE_SAMPLING = caution(
+    "coarse-sampling",
+    "pixels of {pixel_nm:g} nm sampled at their centres count more light than was collected",
+    'set camera.samples_per_pixel = "auto"',
+    "howto/planning",
+)
+
+FAINT_PICTURES = caution(
+    "faint-pictures",
+    "one picture has a signal-to-noise ratio of {snr:.2g}, and iscat calibrate optics uses those "
+    "above {least:g}",
+    "take heavier particles, more frames, or more light",
+    "howto/planning",
+)
+
+PICTURES_LEFT_OUT = note(
+    "pictures-left-out",
+    "of {events} pictures iscat calibrate optics uses the {used} brightest",
+    "",
+    "howto/planning",
 )
