@@ -7,16 +7,27 @@ from typing import Any
 
 import numpy as np
 import panel as pn
-from bokeh.models import ColumnDataSource, LinearColorMapper
-from bokeh.palettes import gray
-from bokeh.plotting import figure
 
 import iscat_analysis as ia
-from iscat_app.chosen import Chosen, Notice, table_of
+from iscat_app.chosen import Chosen, Notice
+from iscat_app.widgets import Picture, listing
 
 _PIXELS = 61
-_KINDS = {"crb_single": "CRB, alone", "crb_joint": "CRB, together", "qcrb": "QCRB"}
-_KEYS = {"x_nm": "x [nm]", "y_nm": "y [nm]", "z_nm": "z [nm]", "mass_kda": "mass [kDa]"}
+_COLUMNS = (
+    " | CRB, alone | CRB, together | QCRB",
+    "{name} | {crb_single:.4g} | {crb_joint:.4g} | {qcrb:.4g}",
+)
+_NAMES = {"x_nm": "x [nm]", "y_nm": "y [nm]", "z_nm": "z [nm]", "mass_kda": "mass [kDa]"}
+_SLIDERS = {
+    "optics.na": ("NA", 0.8, 1.48, 0.01, 1.42),
+    "optics.focus_nm": ("Focus [nm]", -1000, 1000, 10, -300),
+    "optics.attenuation": ("Attenuation", 0.02, 1, 0.02, 1),
+    "bounds.photons_per_pixel": ("Photoelectrons per pixel and frame", 1e3, 2e5, 1e3, 5e4),
+    "bounds.n_after": ("Frames", 1, 1000, 1, 100),
+    "particle.mass_kda": ("Mass [kDa]", 10, 2000, 5, 150),
+    "particle.height_nm": ("Height [nm]", 0, 500, 5, 5),
+}
+"""Labels by key of the configuration, with first and last value, step, and the value at first."""
 
 
 class Bounds:
@@ -29,43 +40,24 @@ class Bounds:
         self._notice = Notice()
         self._config: ia.Config | None = None
         self._seen = False
-        slider = pn.widgets.FloatSlider
         self._sliders = {
-            "optics.na": slider(label="NA", start=0.8, end=1.48, step=0.01, value=1.42),
-            "optics.focus_nm": slider(
-                label="Focus [nm]", start=-1000, end=1000, step=10, value=-300
-            ),
-            "optics.attenuation": slider(
-                label="Attenuation", start=0.02, end=1, step=0.02, value=1
-            ),
-            "bounds.photons_per_pixel": slider(
-                label="Photoelectrons per pixel and frame", start=1000, end=200_000, step=1000,
-                value=50_000,
-            ),
-            "bounds.n_after": slider(label="Frames", start=1, end=1000, step=1, value=100),
-            "particle.mass_kda": slider(label="Mass [kDa]", start=10, end=2000, step=5, value=150),
-            "particle.height_nm": slider(label="Height [nm]", start=0, end=500, step=5, value=5),
-        }  # fmt: skip
+            key: pn.widgets.FloatSlider(label=label, start=start, end=end, step=step, value=value)
+            for key, (label, start, end, step, value) in _SLIDERS.items()
+        }
         self._mode = pn.widgets.Select(
             label="Free", width=150, value="joint", options=["mass", "localize", "joint"]
         )
-        self._image = ColumnDataSource({"image": [np.zeros((_PIXELS, _PIXELS))]})
-        self._mapper = LinearColorMapper(palette=gray(256), low=-1, high=1)
-        plot = figure(width=380, height=380, tools="", toolbar_location=None,
-                      title="What the camera sees of it")  # fmt: skip
-        plot.image(image="image", x=0, y=0, dw=_PIXELS, dh=_PIXELS, source=self._image,
-                   color_mapper=self._mapper)  # fmt: skip
-        plot.y_range.flipped = True
-        self._table = pn.pane.HTML("")
-        self._note = pn.pane.HTML("")
-        for widget in (*self._sliders.values(), self._mode):
-            widget.param.watch(self._follow, "value")
+        self._picture = Picture(300)
+        self._picture.fit(_PIXELS, _PIXELS)
+        self._picture.figure.title.text = "What the camera sees of it"
+        self._table, self._note = pn.pane.HTML(""), pn.pane.HTML("")
+        self._notice.watch(self._follow, *self._sliders.values(), self._mode)
         self.body = pn.Column(
             self._notice.pane,
             pn.FlexBox(
                 pn.Column(*self._sliders.values(), self._mode),
                 pn.Column(self._table, self._note),
-                pn.pane.Bokeh(plot),
+                pn.pane.Bokeh(self._picture.figure),
             ),
         )
 
@@ -77,7 +69,7 @@ class Bounds:
             )
         self._follow()
 
-    def _follow(self, *_: Any) -> None:
+    def _follow(self) -> None:
         """Compute what the sliders say now: they move faster than that."""
         config, settings = self._config, self._settings()
         self._notice.latest(
@@ -99,13 +91,9 @@ class Bounds:
         found, image, took_s = computed
         self._seen = True
         most = float(np.abs(image).max()) or 1.0
-        self._mapper.update(low=-most, high=most)
-        self._image.data = {"image": [image]}
-        rows = [
-            (_KEYS[str(name)], *(f"{row[kind]:.4g}" for kind in _KINDS))
-            for name, row in found.actual.iterrows()
-        ]
-        self._table.object = table_of(rows, ("", *_KINDS.values()))
+        self._picture.show(image, -most, most)
+        rows = [row | {"name": _NAMES[name]} for name, row in found.actual.T.to_dict().items()]
+        self._table.object = listing(rows, *_COLUMNS)
         peak = 100 * image.flat[np.abs(image).argmax()]
         self._note.object = (
             f"<p>Peak contrast {peak:.3f} %. Standard deviations after all frames, with as many "
@@ -120,8 +108,7 @@ def _computed(
     """Compute bounds and picture, and say how long that took."""
     began = time.perf_counter()
     found = ia.compute_bounds(config, settings=settings)
-    image = ia.psf(
-        found.config.optics, found.config.particle, found.config.camera, pixels=_PIXELS,
-        calibration=found.config.calibration,
-    )  # fmt: skip
+    setup = found.config
+    particle = setup.optics, setup.particle, setup.camera
+    image = ia.psf(*particle, pixels=_PIXELS, calibration=setup.calibration)
     return found, image, time.perf_counter() - began

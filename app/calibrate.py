@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import panel as pn
 from bokeh.events import DoubleTap, Tap
-from bokeh.models import ColumnDataSource, Range1d, Whisker
-from bokeh.plotting import figure
+from bokeh.models import Range1d, Whisker
 
 from iscat_analysis.answers.calibrations import contrast_peaks, mass_calibration
 from iscat_analysis.calibration import ContrastPeak, MassCalibration
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import path_beside
-from iscat_app.chosen import Chosen, Notice, in_line, masses_in, table_of
+from iscat_app import widgets as ui
+from iscat_app.chosen import Chosen, Notice, masses_in
 from iscat_app.files import listed
 from iscat_app.runs import Job, Kind, Queue
 from iscat_app.settings import Taken
 
-_HEAD = ("standard [kDa]", "contrast", "±", "by the line [kDa]", "95 %", "residual [%]")
+_STANDARDS = (
+    "standard [kDa] | contrast | ± | by the line [kDa] | 95 % | residual [%]",
+    "{mass_kda:g} | {contrast:.4g} | {contrast_se:.2g} | {found_kda:.2f} | {low_kda:.2f} "
+    "to {high_kda:.2f} | {residual_percent:.2f}",
+)
 _NO_DARK = "(none)"
 _HINT = (
     "<small>Click a peak, or choose it from the list, to give it the lightest mass that has none "
@@ -41,72 +44,69 @@ class Calibrate:
         self.peaks: list[ContrastPeak] = []
         self.assigned: dict[int, float] = {}  # masses by number of the peak
         self._make_figures()
-        self._standards = pn.widgets.TextInput(
-            label="Masses of the standards [kDa]", placeholder="66, 146, 480", width=260
-        )
-        fit = pn.widgets.Button(label="Fit the line", color="primary", width=120)
-        forget = pn.widgets.Button(label="Take all masses back", width=160)
+        standards = {"label": "Masses of the standards [kDa]", "placeholder": "66, 146, 480"}
+        self._standards = pn.widgets.TextInput(**standards, width=260)
         self._peak = pn.widgets.Select(label="Peak", width=200)
-        give = pn.widgets.Button(label="Give it a mass, or take it back", width=210)
+        button = self._notice.button
+        masses = (
+            button("Give it a mass, or take it back", 210, lambda: self._give(self._peak.value)),
+            button("Take all masses back", 160, lambda: self._assign({})),
+            button("Fit the line", 120, self._fit, main=True),
+        )
         self._dark = pn.widgets.Select(label="Frames without light", options=[_NO_DARK], width=260)
-        camera = pn.widgets.Button(label="Measure the camera of this movie", width=240)
-        optics = pn.widgets.Button(label="Learn the optics from this movie", width=240)
-        self._table = pn.pane.HTML("", sizing_mode="stretch_width")
+        measured = (
+            button("Measure the camera of this movie", 240, lambda: self._measure("camera")),
+            button("Learn the optics from this movie", 240, lambda: self._measure("optics")),
+        )
+        self._table = ui.wide_pane()
         self._taken = Taken(chosen, self._notice)
-        self._standards.param.watch(lambda _: self._assign({}), "value")
-        fit.on_click(self._fit)
-        give.on_click(lambda _: self._give(self._peak.value))
-        forget.on_click(lambda _: self._assign({}))
-        camera.on_click(lambda _: self._measure("camera"))
-        optics.on_click(lambda _: self._measure("optics"))
+        self._notice.watch(lambda: self._assign({}), self._standards)
         self.body = pn.Column(
             self._notice.pane,
             "### Masses, from standards",
-            in_line(self._standards, self._peak, give, forget, fit),
+            ui.in_line(self._standards, self._peak, *masses),
             pn.pane.HTML(_HINT),
             pn.FlexBox(self._histogram_pane, self._line_pane),
             self._table,
             "### Camera and optics, from the movie that is chosen",
-            in_line(self._dark, camera, optics),
+            ui.in_line(self._dark, *measured),
             "### Use a calibration",
             self._taken.body,
         )
 
     def _make_figures(self) -> None:
-        self._points = ColumnDataSource({"mass": [], "contrast": [], "low": [], "high": []})
-        self._line = ColumnDataSource({"mass": [], "contrast": []})
-        self._bars = ColumnDataSource({"left": [], "right": [], "top": []})
-        self._marks = ColumnDataSource({"x": [], "y": [], "text": [], "colour": []})
-        plot = figure(width=480, height=300, x_axis_label="mass [kDa]",
-                      y_axis_label="|contrast| [%]", tools="pan,wheel_zoom,reset,save")  # fmt: skip
-        plot.line("mass", "contrast", source=self._line, color="#D55E00")
-        plot.scatter("mass", "contrast", source=self._points, size=9, color="#0072B2")
-        plot.add_layout(Whisker(base="mass", lower="low", upper="high", source=self._points))
-        peaks = figure(width=520, height=300, x_axis_label="|contrast| [%]", y_axis_label="events",
-                       tools="xwheel_zoom,xpan,reset,tap", y_range=Range1d(0, 1))  # fmt: skip
-        peaks.quad(left="left", right="right", top="top", bottom=0, source=self._bars,
-                   color="#8A8F96", line_color="white", nonselection_alpha=1)  # fmt: skip
-        peaks.scatter("x", "y", source=self._marks, marker="inverted_triangle", size=12,
-                      color="colour", nonselection_alpha=1)  # fmt: skip
-        peaks.text("x", "y", text="text", source=self._marks, text_align="center", y_offset=-10,
-                   text_font_size="12px", text_color="colour", nonselection_alpha=1)  # fmt: skip
+        self._points = ui.source("mass", "contrast", "low", "high")
+        self._line = ui.source("mass", "contrast")
+        self._bars = ui.source("left", "right", "top")
+        self._marks = ui.source("x", "y", "text", "colour")
+        axes = "mass [kDa]", "|contrast| [%]"
+        shown = ui.plot((480, 300), axes, "pan,wheel_zoom,reset,save")
+        shown.line("mass", "contrast", source=self._line, color=ui.RED)
+        shown.scatter("mass", "contrast", source=self._points, size=9, color=ui.BLUE)
+        shown.add_layout(Whisker(base="mass", lower="low", upper="high", source=self._points))
+        peaks = ui.plot((520, 300), ("|contrast| [%]", "events"), "xwheel_zoom,xpan,reset,tap")
+        peaks.y_range = Range1d(0, 1)
+        edges = {"left": "left", "right": "right", "top": "top", "bottom": 0}
+        look = {"line_color": "white", "nonselection_alpha": 1}
+        peaks.quad(**edges, source=self._bars, color=ui.GREY, **look)
+        mark = {"marker": "inverted_triangle", "size": 12, "nonselection_alpha": 1}
+        peaks.scatter("x", "y", source=self._marks, color="colour", **mark)
+        word = {"text_align": "center", "y_offset": -10, "text_font_size": "12px"}
+        word |= {"text_color": "colour", "nonselection_alpha": 1}
+        peaks.text("x", "y", text="text", source=self._marks, **word)
         for kind in (Tap, DoubleTap):  # of two clicks that are fast the second is the latter
             peaks.on_event(kind, lambda event: self._clicked(event.x))
-        plot.toolbar.logo = peaks.toolbar.logo = None
         self._histogram = peaks
         self._histogram_pane = pn.Column(pn.pane.Bokeh(peaks), visible=False)
-        self._line_pane = pn.Column(pn.pane.Bokeh(plot), visible=False)
+        self._line_pane = pn.Column(pn.pane.Bokeh(shown), visible=False)
 
     def refresh(self) -> None:
         """Show the contrasts of the result that is chosen."""
         self._taken.refresh()
         movie, result = self._chosen.movie, self._chosen.result
-        others = (
-            []
-            if movie is None
-            else [entry.path.name for entry in listed(movie.parent) if entry.kind == "movie"]
-        )
-        darks = [_NO_DARK, *(name for name in others if movie is None or name != movie.name)]
+        entries = [] if movie is None else listed(movie.parent)
+        others = [e.path.name for e in entries if e.kind == "movie" and e.path != movie]
+        darks = [_NO_DARK, *others]
         if darks != self._dark.options:
             self._dark.options = darks
         if result == self._result and self.peaks:
@@ -127,33 +127,26 @@ class Calibrate:
 
     # ---- which peak has which mass ----------------------------------------------------------
 
-    def _masses(self) -> list[float] | None:
-        try:
-            return sorted(masses_in(self._standards.value))
-        except DataError as error:
-            self._notice.say(str(error), "error")
-            return None
+    def _masses(self) -> list[float]:
+        return sorted(masses_in(self._standards.value))
 
     def _clicked(self, contrast_percent: float | None) -> None:
         if self.peaks and contrast_percent is not None:
             away = [abs(100 * peak.contrast - contrast_percent) for peak in self.peaks]
-            self._give(int(np.argmin(away)))
+            self._notice.tried(lambda: self._give(int(np.argmin(away))))
 
     def _give(self, peak: int | None) -> None:
         """Give a peak the next mass, or take its mass back."""
         masses = self._masses()
-        if peak is None or masses is None:
-            return
-        if not masses:
-            self._notice.say("Write the masses of the standards first.")
-            return
         free = [mass for mass in masses if mass not in self.assigned.values()]
+        if not masses:
+            raise DataError("Write the masses of the standards first.")
         if peak in self.assigned:
             self._assign({k: mass for k, mass in self.assigned.items() if k != peak})
-        elif free:
+        elif peak is not None and not free:
+            raise DataError("Every mass has a peak: take one back first.")
+        elif peak is not None:
             self._assign(self.assigned | {peak: free[0]})
-        else:
-            self._notice.say("Every mass has a peak: take one back first.")
 
     def _assign(self, assigned: dict[int, float]) -> None:
         self.assigned = assigned
@@ -168,7 +161,7 @@ class Calibrate:
             "x": places,
             "y": [1.08 * y for y in near],
             "text": [f"{assigned[k]:g} kDa" if k in assigned else "" for k in range(len(places))],
-            "colour": ["#D55E00" if k in assigned else "#0072B2" for k in range(len(places))],
+            "colour": [ui.RED if k in assigned else ui.BLUE for k in range(len(places))],
         }
         texts = [
             f"{k + 1}: {x:.3g} %" + (f", {assigned[k]:g} kDa" if k in assigned else "")
@@ -184,9 +177,9 @@ class Calibrate:
 
     # ---- calibrations -----------------------------------------------------------------------
 
-    def _fit(self, _: Any) -> None:
+    def _fit(self) -> None:
         result, masses = self._chosen.result, self._masses()
-        if result is None or masses is None:
+        if result is None:
             return
         places: list[float] | None = None
         if self.assigned:
@@ -204,34 +197,18 @@ class Calibrate:
 
     def _show(self, found: MassCalibration, notes: list[str], out: Path) -> None:
         rows = found.standards.to_dict("records")
-        self._points.data = {
-            "mass": [r["mass_kda"] for r in rows],
-            "contrast": [100 * abs(r["contrast"]) for r in rows],
-            "low": [100 * (abs(r["contrast"]) - r["contrast_se"]) for r in rows],
-            "high": [100 * (abs(r["contrast"]) + r["contrast_se"]) for r in rows],
-        }
+        contrast, error = 100 * found.standards["contrast"].abs(), found.standards["contrast_se"]
+        bars = {"low": contrast - 100 * error, "high": contrast + 100 * error}
+        self._points.data = {"mass": found.standards["mass_kda"], "contrast": contrast, **bars}
         self._line_pane.visible = True
         slope, offset = found.gradient_per_kda, found.offset
         ends = [0.0, 1.1 * max(r["mass_kda"] for r in rows)]
         self._line.data = {"mass": ends, "contrast": [100 * abs(slope * m + offset) for m in ends]}
-        self._table.object = table_of(
-            [
-                (
-                    f"{r['mass_kda']:g}", f"{r['contrast']:.4g}", f"{r['contrast_se']:.2g}",
-                    f"{r['found_kda']:.2f}", f"{r['low_kda']:.2f} to {r['high_kda']:.2f}",
-                    f"{r['residual_percent']:.2f}",
-                )
-                for r in rows
-            ],
-            _HEAD,
-        ) + table_of([(note,) for note in (f"saved in {out}", *notes)])  # fmt: skip
+        self._table.object = ui.listing(rows, *_STANDARDS) + ui.lines([f"saved in {out}", *notes])
         self._taken.refresh()
 
     def _measure(self, kind: Kind) -> None:
-        movie = self._chosen.movie
-        if movie is None:
-            self._notice.say("Choose a movie under Open.", "error")
-            return
+        movie = self._chosen.wanted_movie
         dark = None
         if kind == "camera" and self._dark.value != _NO_DARK:
             dark = movie.with_name(self._dark.value)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -52,6 +52,13 @@ class Chosen(param.Parameterized):
         return None if self.movie is None else setup_beside(self.movie)
 
     @property
+    def wanted_movie(self) -> Path:
+        """The movie, which somebody has to choose first."""
+        if self.movie is None:
+            raise DataError("Choose a movie under Open.")
+        return Path(self.movie)
+
+    @property
     def config(self) -> Path | None:
         """The configuration of the movie, where there is one."""
         return self.setup if self.setup is not None and self.setup.is_file() else None
@@ -92,6 +99,24 @@ class Notice:
             self.say(str(error), "error")
         except (OSError, MemoryError) as error:
             self.say(f"{type(error).__name__}: {error}", "error")
+
+    def button(
+        self, text: str, width: int, action: Callable[[], Any], *, main: bool = False
+    ) -> Any:
+        """Make a button that does something when it is clicked, and shows what is refused."""
+        made = pn.widgets.Button(label=text, width=width, color="primary" if main else "default")
+        made.on_click(lambda _: self.tried(action))
+        return made
+
+    def watch(self, action: Callable[[], Any], *widgets: Any, what: str = "value") -> None:
+        """Do something whenever the value of a widget changes, and show what is refused."""
+        for widget in widgets:
+            widget.param.watch(lambda _: self.tried(action), what)
+
+    def tried(self, action: Callable[[], Any]) -> None:
+        """Do something, and show what is refused."""
+        with self.told():
+            action()
 
     def latest(self, what: str, job: Callable[[], T], then: Callable[[T], None]) -> None:
         """Do the newest of jobs that are asked for faster than they can be done."""
@@ -149,23 +174,7 @@ def masses_in(text: str) -> list[float]:
         raise DataError(f"{text}: write masses in kDa, as in 66, 146") from None
 
 
-def in_line(*parts: Any) -> pn.FlexBox:
-    """Put widgets beside each other, on one base line; where the page is narrow, below."""
-    return pn.FlexBox(*parts, align_items="end", sizing_mode="stretch_width")
-
-
 def link_to(page: Path, text: str) -> str:
     """Link to a page that the commands wrote."""
     address = html.escape("page?" + urlencode({"path": str(page)}))
     return f'<a href="{address}" target="_blank" style="color: inherit">{html.escape(text)}</a>'
-
-
-def table_of(rows: Sequence[tuple[str, ...]], head: tuple[str, ...] = ()) -> str:
-    """Write a table as HTML; its cells are text."""
-
-    def line(cells: tuple[str, ...], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(c)}</{tag}>" for c in cells) + "</tr>"
-
-    top = f"<thead>{line(head, 'th')}</thead>" if head else ""
-    body = "".join(line(row, "td") for row in rows)
-    return f'<div style="overflow-x: auto"><table>{top}<tbody>{body}</tbody></table></div>'

@@ -5,17 +5,22 @@ from __future__ import annotations
 import io
 import json
 import shlex
+from collections.abc import Callable
+from functools import partial
 from typing import Any, get_args
 
+import pandas as pd
 import panel as pn
 
 import iscat_analysis as ia
+from iscat_analysis.answers.gates import gate_rows
 from iscat_analysis.config import config_to_toml
 from iscat_analysis.movie import path_beside
 from iscat_analysis.report.species import FONTS, PALETTES, Format, figure_bytes, histogram_figure
-from iscat_app.chosen import Chosen, Notice, in_line
+from iscat_app.chosen import Chosen, Notice
 from iscat_app.compare import Compare
 from iscat_app.results import Results
+from iscat_app.widgets import in_line
 
 _ONE, _SEVERAL = "histogram of the result", "samples of Compare"
 
@@ -28,48 +33,44 @@ class Export:
     def __init__(self, chosen: Chosen, results: Results, compare: Compare) -> None:
         self._chosen, self._results, self._compare = chosen, results, compare
         self._notice = Notice()
-        self._what = pn.widgets.Select(label="Figure", options=[_ONE, _SEVERAL], width=200)
-        self._width = pn.widgets.FloatInput(
-            label="Width [cm]", value=12.0, start=3, end=60, width=100
-        )
-        self._height = pn.widgets.FloatInput(
-            label="Height [cm]", value=8.0, start=3, end=60, width=100
-        )
-        self._font = pn.widgets.FloatInput(label="Font [pt]", value=9.0, start=4, end=40, width=100)
-        self._family = pn.widgets.Select(label="Letters", options=[*FONTS], width=120)
-        self._palette = pn.widgets.Select(label="Colours", options=[*PALETTES], width=180)
+        number, select = pn.widgets.FloatInput, pn.widgets.Select
+        self._what = select(label="Figure", options=[_ONE, _SEVERAL], width=200)
+        self._width = number(label="Width [cm]", value=12.0, start=3, end=60, width=100)
+        self._height = number(label="Height [cm]", value=8.0, start=3, end=60, width=100)
+        self._font = number(label="Font [pt]", value=9.0, start=4, end=40, width=100)
+        self._family = select(label="Letters", options=[*FONTS], width=120)
+        self._palette = select(label="Colours", options=[*PALETTES], width=180)
         self._density = pn.widgets.Checkbox(label="with the kernel density", value=True)
         self._preview = pn.pane.PNG(None, width=560, alt_text="preview of the figure")
         self._command = pn.pane.Str("", sizing_mode="stretch_width")
-        shape = (self._what, self._width, self._height, self._font, self._family, self._palette,
-                 self._density)  # fmt: skip
-        for widget in shape:
-            widget.param.watch(lambda _: self._draw(), "value")
-        buttons = [
-            self._download(f"Figure as {kind.upper()}", lambda kind=kind: self._figure(kind), kind)
+        size = (self._width, self._height, self._font)
+        shape = (self._what, *size, self._family, self._palette, self._density)
+        self._notice.watch(self._draw, *shape)
+        made: dict[str, tuple[str, Callable[[], bytes]]] = {
+            kind: (f"Figure as {kind.upper()}", partial(self._figure, kind))
             for kind in get_args(Format)
+        }
+        made |= {
+            "csv": ("Events as CSV", self._csv),
+            "gates.csv": ("Gates as CSV", self._gates),
+            "toml": ("Configuration as TOML", self._toml),
+            "ipynb": ("Notebook", self._notebook),
+        }
+        self._buttons = [
+            pn.widgets.FileDownload(
+                callback=partial(_in_memory, make),
+                filename=f"histogram.{ending}",
+                label=name,
+                width=240,
+            )
+            for ending, (name, make) in made.items()
         ]
-        buttons += [
-            self._download("Events as CSV", self._csv, "csv"),
-            self._download("Gates as CSV", self._gates, "gates.csv"),
-            self._download("Configuration as TOML", self._toml, "toml"),
-            self._download("Notebook", self._notebook, "ipynb"),
-        ]
-        self._buttons = buttons
         self.body = pn.Column(
             self._notice.pane,
             in_line(*shape),
-            pn.FlexBox(self._preview, pn.Column(*buttons)),
+            pn.FlexBox(self._preview, pn.Column(*self._buttons)),
             "### The same without the window",
             self._command,
-        )
-
-    def _download(self, name: str, make: Any, ending: str) -> Any:
-        def named() -> Any:
-            return make()
-
-        return pn.widgets.FileDownload(
-            callback=named, filename=f"histogram.{ending}", label=name, width=240
         )
 
     def refresh(self) -> None:
@@ -84,53 +85,41 @@ class Export:
             self._notice.say("There is no result yet: analyse the movie under Run.")
             self._preview.object, self._command.object = None, ""
             return
-        self._draw()
+        self._notice.tried(self._draw)
         with self._notice.told():
             self._command.object = self._commands()
 
     def _draw(self) -> None:
         self._notice.say("")
-        with self._notice.told():
-            self._preview.object = self._figure("png").getvalue()
+        self._preview.object = self._figure("png")
 
-    def _figure(self, kind: Format) -> io.BytesIO:
+    def _figure(self, kind: Format) -> bytes:
         results = self._results
         if results.histogram is None or results.result is None:
             raise ia.DataError("there is no histogram yet")
-        shape: dict[str, Any] = {
-            "size_cm": (self._width.value, self._height.value),
-            "font": (self._family.value, self._font.value),
-            "palette": self._palette.value, "density": self._density.value,
-        }  # fmt: skip
+        shape: dict[str, Any] = {"size_cm": (self._width.value, self._height.value)}
+        shape |= {"font": (self._family.value, self._font.value), "palette": self._palette.value}
+        shape["density"] = self._density.value
         if self._what.value == _SEVERAL:
             if len(self._compare.samples) < 2:
                 raise ia.DataError("choose two results or more under Compare")
-            return io.BytesIO(figure_bytes(histogram_figure(self._compare.samples, **shape), kind))
-        drawn = histogram_figure(
-            [(results.result.folder.stem, results.histogram)],
-            gates=results.gates,
-            curve=results.species_curve(),
-            **shape,
-        )
-        return io.BytesIO(figure_bytes(drawn, kind))
+            return figure_bytes(histogram_figure(self._compare.samples, **shape), kind)
+        shape |= {"gates": results.gates, "curve": results.species_curve()}
+        alone = [(results.result.folder.stem, results.histogram)]
+        return figure_bytes(histogram_figure(alone, **shape), kind)
 
-    def _csv(self) -> io.BytesIO:
+    def _csv(self) -> bytes:
         """Write all events; those that were rejected say so."""
         table = self._results.table
         marked = table.assign(rejected_by_hand=table["event"].isin(self._results.rejected))
-        return io.BytesIO(marked.to_csv(index=False).encode())
+        return bytes(marked.to_csv(index=False).encode())
 
-    def _gates(self) -> io.BytesIO:
-        import pandas as pd
+    def _gates(self) -> bytes:
+        return bytes(pd.DataFrame(gate_rows(self._results.gates)).to_csv(index=False).encode())
 
-        from iscat_analysis.answers.gates import gate_rows
-
-        return io.BytesIO(pd.DataFrame(gate_rows(self._results.gates)).to_csv(index=False).encode())
-
-    def _toml(self) -> io.BytesIO:
+    def _toml(self) -> bytes:
         result = self._results.result
-        text = config_to_toml(result.config) if result is not None else ""
-        return io.BytesIO(text.encode())
+        return b"" if result is None else config_to_toml(result.config).encode()
 
     def _commands(self) -> str:
         result = self._results.result
@@ -164,7 +153,7 @@ class Export:
             return None
         return seen.threshold_snr * seen.sigma_kda, seen.sigma_kda
 
-    def _notebook(self) -> io.BytesIO:
+    def _notebook(self) -> bytes:
         result = self._results.result
         if result is None:
             raise ia.DataError("there is no result yet")
@@ -180,10 +169,16 @@ class Export:
             "kept = kept[~kept['event'].isin(rejected)]",
             f"ia.find_species(kept, {known}branch={branch!r}, start_kda={start!r}).species",
         ]
-        cells: list[dict[str, Any]] = [
-            {"cell_type": "code", "execution_count": None, "metadata": {}, "outputs": [],
-             "id": f"cell-{number}", "source": line}
-            for number, line in enumerate(code)
-        ]  # fmt: skip
+        empty: dict[str, Any] = {
+            "cell_type": "code",
+            "execution_count": None,
+            "metadata": {},
+            "outputs": [],
+        }
+        cells = [empty | {"id": f"cell-{n}", "source": line} for n, line in enumerate(code)]
         book = {"cells": cells, "metadata": {}, "nbformat": 4, "nbformat_minor": 5}
-        return io.BytesIO(json.dumps(book, indent=1).encode())
+        return json.dumps(book, indent=1).encode()
+
+
+def _in_memory(make: Callable[[], bytes]) -> io.BytesIO:
+    return io.BytesIO(make())

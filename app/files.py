@@ -13,7 +13,8 @@ import iscat_analysis as ia
 from iscat_analysis.movie import is_named_as_movie, path_beside
 from iscat_analysis.reading import read_json
 from iscat_analysis.report.answer import answer_in
-from iscat_app.chosen import Chosen, Notice, in_line, table_of
+from iscat_app.chosen import Chosen, Notice
+from iscat_app.widgets import in_line, table_of, wide_pane
 
 Kind = Literal["folder", "movie", "result"]
 
@@ -99,16 +100,13 @@ class Files:
             size=18,  # lines of the list
             sizing_mode="stretch_width",
         )
-        self._facts = pn.pane.HTML("", sizing_mode="stretch_width")
-        again = pn.widgets.Button(label="Look again", width=100)
-        again.on_click(lambda _: self.refresh())
-        self._drop = pn.widgets.FileDropper(
-            # Of a file that is dropped on the page; larger ones are opened where they lie
-            label="Copy a small movie here", multiple=True, max_file_size="200MB",
-            sizing_mode="stretch_width", height=90,
-        )  # fmt: skip
+        self._facts = wide_pane()
+        again = self._notice.button("Look again", 100, self.refresh)
+        # Larger files than these are opened where they lie.
+        drop = {"label": "Copy a small movie here", "multiple": True, "max_file_size": "200MB"}
+        self._drop = pn.widgets.FileDropper(**drop, sizing_mode="stretch_width", height=90)
+        self._notice.watch(self.refresh, self._filter)
         self._where.param.watch(self._go, "value")
-        self._filter.param.watch(lambda _: self.refresh(), "value")
         self._list.param.watch(self._pick, "value")
         self._drop.param.watch(self._dropped, "value")
         self.body = pn.FlexBox(

@@ -12,26 +12,24 @@ import panel as pn
 from bokeh.models import (
     BoxAnnotation,
     BoxSelectTool,
-    ColumnDataSource,
     CustomJS,
     LinearAxis,
     Range1d,
     Spinner,
+    WheelZoomTool,
 )
-from bokeh.plotting import figure
 
 import iscat_analysis as ia
 from iscat_analysis.pipeline.preview import RatioFilm
 from iscat_analysis.report.figures import SHOWN_FRAMES
 from iscat_app.chosen import Chosen, Notice
+from iscat_app.widgets import BLUE, ORANGE, RED, YELLOW, Picture, plot, source
 
 RATES = (5, 10, 25, 50, 100, 250, 1000)
 """Frames of the movie per second."""
 
-
-_LANDS, _LEAVES, _DOUBTFUL, _HERE = "#56B4E9", "#CC79A7", "#E69F00", "#F0E442"
+_LANDS, _LEAVES = "#56B4E9", "#CC79A7"
 _SIDE_PX = 560
-_GREYS = (0xFF000000 + 0x010101 * np.arange(256)).astype(np.uint32)  # opaque
 _RATIO, _RAW = "ratiometric", "raw"
 
 
@@ -48,13 +46,13 @@ class Film:
         self._events = pd.DataFrame()
         self._um = 1.0
         self._limits = (0.0, 1.0)
-        self._sent = 0  # pictures
-        self._begun = 0  # of these, before it was played
+        self._begun = 0  # pictures that were sent before it was played
         self._at = 0  # the frame that is shown
         self._next = 0.0  # where the film is, as it plays
         self._ticked = self._slid = 0.0
         self._by_player = False
         self._due = False  # whether a step of the player is to come
+        self._found, self._found_at = pd.DataFrame(), -1
         self._notice = Notice()
         self._make_figures()
         self._make_widgets()
@@ -62,106 +60,70 @@ class Film:
     # ---- what there is to see ---------------------------------------------------------------
 
     def _make_figures(self) -> None:
-        self._picture = ColumnDataSource(
-            {"image": [np.zeros((2, 2), np.uint32)], "sent": [0], "dw": [1.0], "dh": [1.0]}
-        )
-        self._rings = ColumnDataSource({"x": [], "y": [], "colour": [], "text": []})
-        self._x, self._y = Range1d(0, 1), Range1d(1, 0)
-        self._figure = figure(
-            width=_SIDE_PX + 60, height=_SIDE_PX + 40, x_range=self._x, y_range=self._y,
-            tools="pan,wheel_zoom,box_zoom,zoom_in,zoom_out,reset,save", active_scroll="wheel_zoom",
-            output_backend="canvas", toolbar_location="right",
-        )  # fmt: skip
-        self._figure.grid.visible, self._figure.toolbar.logo = False, None
-        # Coloured here, which is a tenth of the work that it is in the browser.
-        self._figure.image_rgba(image="image", x=0, y=0, dw="dw", dh="dh", source=self._picture)
-        self._figure.scatter(
-            "x", "y", source=self._rings, marker="circle", size=22, line_color="colour",
-            line_width=2, fill_color=None,
-        )  # fmt: skip
-        self._figure.text(
-            "x", "y", text="text", source=self._rings, text_color="colour", text_font_size="11px",
-            x_offset=12, y_offset=-8,
-        )  # fmt: skip
-        self._bar = ColumnDataSource({"x": [], "y": [], "text": []})
-        self._figure.line("x", "y", source=self._bar, line_width=5, color=_HERE)
-        self._figure.text(
-            "x", "y", text="text", source=self._bar, text_color=_HERE, y_offset=-6,
-            text_font_size="12px",
-        )  # fmt: skip
+        tools = "pan,wheel_zoom,box_zoom,zoom_in,zoom_out,reset,save"
+        self._picture = Picture(_SIDE_PX, tools)
+        shown = self._picture.figure
+        shown.output_backend = "canvas"
+        shown.toolbar.active_scroll = shown.select_one({"type": WheelZoomTool})
+        self._bar = source("x", "y", "text")
+        shown.line("x", "y", source=self._bar, line_width=5, color=YELLOW)
+        shown.text("x", "y", text="text", source=self._bar, text_color=YELLOW, y_offset=-6)
         # The browser says which picture it has drawn, and only then the next one is sent.
         self._drawn = Spinner(value=0, visible=False, title="pictures drawn")
-        self._picture.js_on_change(
-            "data",
-            CustomJS(
-                args={"drawn": self._drawn, "picture": self._picture},
-                code="requestAnimationFrame(() => { drawn.value = picture.data.sent[0] })",
-            ),
-        )
+        answer = "requestAnimationFrame(() => { drawn.value = picture.data.sent[0] })"
+        both = {"drawn": self._drawn, "picture": self._picture.data}
+        self._picture.data.js_on_change("data", CustomJS(args=both, code=answer))
         self._drawn.on_change("value", self._browser_has_drawn)
 
-        self._trace = ColumnDataSource({"frame": [], "light": [], "noise": []})
-        self._light = figure(
-            width=_SIDE_PX + 60, height=170, tools="reset", x_axis_label="frame",
-            y_axis_label="light [counts]", toolbar_location=None, x_range=Range1d(0, 1),
-            y_range=Range1d(0, 1),
-        )  # fmt: skip
-        self._light.line("frame", "light", source=self._trace, color="#0072B2")
+        self._trace = source("frame", "light", "noise")
+        self._light = plot((_SIDE_PX + 60, 170), ("frame", "light [counts]"), "reset")
+        self._light.update(toolbar_location=None, x_range=Range1d(0, 1), y_range=Range1d(0, 1))
+        self._light.line("frame", "light", source=self._trace, color=BLUE)
         self._light.extra_y_ranges = {"noise": Range1d(0, 1)}
         self._light.add_layout(LinearAxis(y_range_name="noise", axis_label="noise"), "right")
-        self._light.line(
-            "frame", "noise", source=self._trace, color="#D55E00", y_range_name="noise"
-        )
+        self._light.line("frame", "noise", source=self._trace, color=RED, y_range_name="noise")
         marks = self._light.scatter("frame", "light", source=self._trace, size=3, alpha=0)
-        self._band = BoxAnnotation(left=0, right=0, fill_alpha=0.15, fill_color=_DOUBTFUL)
+        self._band = BoxAnnotation(left=0, right=0, fill_alpha=0.15, fill_color=ORANGE)
         self._light.add_layout(self._band)
         self._light.add_tools(BoxSelectTool(dimensions="width", renderers=[marks]))
 
     def _make_widgets(self) -> None:
+        slider, integer = pn.widgets.IntSlider, pn.widgets.IntInput
         self.play = pn.widgets.Toggle(label="▶ Play", width=90)
-        self.frame = pn.widgets.IntSlider(label="Frame", start=0, end=1, width=470)
-        self.rate = pn.widgets.Select(
-            label="Frames per second", options=list(RATES), value=25, width=130
-        )
+        self.frame = slider(label="Frame", start=0, end=1, width=470)
+        rates = {"options": list(RATES), "value": 25, "width": 130}
+        self.rate = pn.widgets.Select(label="Frames per second", **rates)
         self.kind = pn.widgets.RadioButtonGroup(options=[_RATIO, _RAW], value=_RATIO)
-        self.window = pn.widgets.IntSlider(label="Window [frames]", start=1, end=2, width=300)
-        self.contrast = pn.widgets.RangeSlider(
-            label="Black and white at", start=0, end=1, value=(0, 1), step=0.01, width=300
-        )
+        self.window = slider(label="Window [frames]", start=1, end=2, width=300)
+        ends = {"start": 0, "end": 1, "value": (0, 1), "step": 0.01, "width": 300}
+        self.contrast = pn.widgets.RangeSlider(label="Black and white at", **ends)
         self.search = pn.widgets.Checkbox(label="Mark what the search sees in this frame")
         self.events = pn.widgets.Checkbox(label="Ring the events of the result", value=True)
-        self.first = pn.widgets.IntInput(label="Marked frames, from", start=0, value=0, width=140)
-        self.last = pn.widgets.IntInput(label="to", start=0, value=0, width=140)
-        self.use_span = pn.widgets.Button(label="Analyse only these frames", disabled=True)
-        self.leave_out = pn.widgets.Button(label="Leave these frames out", disabled=True)
+        self.first = integer(label="Marked frames, from", start=0, value=0, width=140)
+        self.last = integer(label="to", start=0, value=0, width=140)
+        self.use_span = self._notice.button("Analyse only these frames", 300, self._keep_span)
+        self.leave_out = self._notice.button("Leave these frames out", 300, self._exclude)
+        self.use_span.disabled = self.leave_out.disabled = True
         self.facts = pn.pane.HTML("", width=320)
         self.play.param.watch(self._play, "value")
-        self.frame.param.watch(self._frame_moved, "value")
-        self.kind.param.watch(self._kind_changed, "value")
-        self.window.param.watch(self._window_changed, "value_throttled")
         self.contrast.param.watch(self._contrast_changed, "value")
-        self.search.param.watch(self._search_changed, "value")
-        self.events.param.watch(lambda _: self._ring(), "value")
+        self._notice.watch(self._window_changed, self.window, what="value_throttled")
+        self._notice.watch(self._frame_moved, self.frame)
+        self._notice.watch(self._kind_changed, self.kind)
+        self._notice.watch(self._search_changed, self.search)
+        self._notice.watch(self._ring, self.events)
+        self._notice.watch(self._show_span, self.first, self.last)
         self._trace.selected.on_change("indices", self._marked)
-        for end in (self.first, self.last):
-            end.param.watch(lambda _: self._show_span(), "value")
-        self.use_span.on_click(self._keep_span)
-        self.leave_out.on_click(self._exclude)
+        drawn, light = pn.pane.Bokeh(self._picture.figure), pn.pane.Bokeh(self._light)
+        how = (self.kind, self.rate, self.window, self.contrast, self.events, self.search)
+        span = (pn.Row(self.first, self.last), self.use_span, self.leave_out)
         self.body = pn.Column(
             self._notice.pane,
             pn.FlexBox(
-                pn.Column(
-                    pn.Row(self.play, self.frame),
-                    pn.pane.Bokeh(self._figure),
-                    pn.pane.Bokeh(self._light),
-                ),
-                pn.Column(
-                    self.kind, self.rate, self.window, self.contrast, self.events, self.search,
-                    self.facts, pn.Row(self.first, self.last), self.use_span, self.leave_out,
-                    pn.pane.Bokeh(self._drawn), width=340,
-                ),
+                pn.Column(pn.Row(self.play, self.frame), drawn, light),
+                pn.Column(*how, self.facts, *span, pn.pane.Bokeh(self._drawn), width=340),
             ),
-        )  # fmt: skip
+        )
 
     # ---- the movie --------------------------------------------------------------------------
 
@@ -218,13 +180,11 @@ class Film:
         self._um = (pixel_nm or 1000.0) / 1000.0
         frames, rows, columns = stack.shape
         unit = "µm" if pixel_nm else "pixels"
-        self._figure.xaxis.axis_label = self._figure.yaxis.axis_label = unit
-        width, height = columns * self._um, rows * self._um
-        self._x.update(start=0, end=width, reset_start=0, reset_end=width)
-        self._y.update(start=height, end=0, reset_start=height, reset_end=0)
-        side = _SIDE_PX / max(rows, columns)
-        self._figure.update(width=round(columns * side) + 80, height=round(rows * side) + 50)
-        self._bar.data = _bar_of(width, height) if pixel_nm else {"x": [], "y": [], "text": []}
+        shown = self._picture.figure
+        shown.xaxis.axis_label = shown.yaxis.axis_label = unit
+        self._picture.fit(rows, columns, self._um)
+        bar = _bar_of(columns * self._um, rows * self._um)
+        self._bar.data = bar if pixel_nm else {"x": [], "y": [], "text": []}
         self.window.param.update(end=max(self._film.longest, 2), value=self._film.window)
         self.frame.param.update(end=frames - 1)
         for end, value in ((self.first, 0), (self.last, frames - 1)):
@@ -246,7 +206,7 @@ class Film:
             self.play.value = False
         elif event.new:
             self._next, self._ticked = float(self.frame.value), time.monotonic()
-            self._begun = self._sent
+            self._begun = self._picture.sent
             self._soon()
         elif self._film is not None:
             self._shown_by_player(self.frame.value)
@@ -254,7 +214,7 @@ class Film:
     def _soon(self) -> None:
         """Show the next frame when it is time for it."""
         document = pn.state.curdoc
-        ahead = self._sent - max(self._drawn.value, self._begun)
+        ahead = self._picture.sent - max(self._drawn.value, self._begun)
         # Pictures on their way to the browser at most
         if document is not None and not self._due and ahead < 2:
             self._due = True
@@ -285,12 +245,11 @@ class Film:
         self.frame.value = self._at = self._chosen.view = frame
         self._by_player = False
 
-    def _browser_has_drawn(self, attr: str, old: Any, new: Any) -> None:
-        del attr, old, new
+    def _browser_has_drawn(self, _attr: str, _old: Any, _new: Any) -> None:
         if self.play.value:
             self._soon()
 
-    def _frame_moved(self, _: Any) -> None:
+    def _frame_moved(self) -> None:
         if not self._by_player:
             self._at = self._chosen.view = self.frame.value
             self._next = float(self._at)
@@ -298,19 +257,18 @@ class Film:
             if self.search.value:
                 self._look()
 
-    def _kind_changed(self, _: Any) -> None:
+    def _kind_changed(self) -> None:
         if self._film is not None:
             self._fit_limits()
             self._show()
 
-    def _window_changed(self, event: Any) -> None:
+    def _window_changed(self) -> None:
         if self._film is not None:
-            with self._notice.told():
-                self._film.window = event.new
-                self._fit_limits()
-                self._show()
-                if self.search.value:
-                    self._look()
+            self._film.window = self.window.value_throttled
+            self._fit_limits()
+            self._show()
+            if self.search.value:
+                self._look()
 
     def _fit_limits(self) -> None:
         if self._film is None:
@@ -343,16 +301,7 @@ class Film:
         with self._notice.told():
             at = self._at
             image = film.contrast(at) if self.kind.value == _RATIO else film.raw(at)
-            low, high = self._limits
-            scaled = np.clip((image - low) * (255.0 / (high - low)), 0, 255)
-            rows, columns = image.shape
-            self._sent += 1
-            self._picture.data = {
-                "image": [_GREYS[np.nan_to_num(scaled).astype(np.uint8)]],
-                "sent": [self._sent],
-                "dw": [columns * self._um],
-                "dh": [rows * self._um],
-            }
+            self._picture.show(image, *self._limits, self._um)
             self._ring()
 
     # ---- what was found ---------------------------------------------------------------------
@@ -367,28 +316,18 @@ class Film:
             ]
             for row in near.to_dict("records"):
                 ok = row["status"] == "ok"
-                colour = _DOUBTFUL if not ok else _LANDS if row["mass_kda"] > 0 else _LEAVES
+                colour = ORANGE if not ok else _LANDS if row["mass_kda"] > 0 else _LEAVES
                 text = f"{row['mass_kda']:.0f}"
                 if row["event"] == self._chosen.event:
-                    colour, text = _HERE, f"event {row['event']}: {text} kDa"
+                    colour, text = YELLOW, f"event {row['event']}: {text} kDa"
                 rings.append((row["x_px"], row["y_px"], colour, text))
         if self.search.value and self._found_at == at:
             for row in self._found.to_dict("records"):
-                rings.append((row["x_px"], row["y_px"], _HERE, f"{row['snr']:.1f} σ"))
-        data = {
-            "x": [(x + 0.5) * self._um for x, *_ in rings],
-            "y": [(y + 0.5) * self._um for _, y, *_ in rings],
-            "colour": [ring[2] for ring in rings],
-            "text": [ring[3] for ring in rings],
-        }
-        if data != self._rings.data:
-            self._rings.data = data
+                rings.append((row["x_px"], row["y_px"], YELLOW, f"{row['snr']:.1f} σ"))
+        self._picture.ring(rings, self._um)
 
-    _found_at = -1
-    _found = pd.DataFrame()
-
-    def _search_changed(self, event: Any) -> None:
-        if not event.new:
+    def _search_changed(self) -> None:
+        if not self.search.value:
             self._ring()
         elif self._film is None:
             self.search.value = False
@@ -437,8 +376,7 @@ class Film:
 
     # ---- frames to analyse ------------------------------------------------------------------
 
-    def _marked(self, attr: str, old: Any, new: list[int]) -> None:
-        del attr, old
+    def _marked(self, _attr: str, _old: Any, new: list[int]) -> None:
         if new:
             frames = np.asarray(self._trace.data["frame"])[new]
             self.first.value, self.last.value = int(frames.min()), int(frames.max())
@@ -454,13 +392,13 @@ class Film:
         first, last = self.first.value, self.last.value  # None where the field is empty
         return first or 0, (self.frame.end if last is None else last) + 1
 
-    def _exclude(self, _: Any) -> None:
+    def _exclude(self) -> None:
         first, stop = self._chosen.excluded = self._span()
         self._notice.say(
             f"[{first}, {stop}] goes into fit.excluded_frames of the form: save it under Set up."
         )
 
-    def _keep_span(self, _: Any) -> None:
+    def _keep_span(self) -> None:
         first, stop = self._chosen.span = self._span()
         self._notice.say(
             f"fit.frames = [{first}, {stop}] goes into the form: save it under Set up."

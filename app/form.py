@@ -6,22 +6,22 @@ import html
 import math
 import re
 import tomllib
-from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin
 
 import numpy as np
 import pandas as pd
 import panel as pn
-from bokeh.models import ColumnDataSource, LinearColorMapper, Range1d
-from bokeh.palettes import gray
-from bokeh.plotting import figure
 
 import iscat_analysis as ia
+from iscat_analysis.movie import setup_beside
 from iscat_analysis.pipeline.setup import Setup, write_setup
 from iscat_app.chosen import Chosen, Notice
 from iscat_app.settings import Taken, config_of, plain, read_texts, toml_text, write_texts
+from iscat_app.widgets import YELLOW, Picture
 
 _SIDE_PX = 380
 _ENDS = (0.005, 0.995)  # quantiles that are black and white
@@ -34,29 +34,11 @@ class DetectionPreview:
         self._chosen, self._notice = chosen, notice
         self._config: ia.Config | None = None
         self.asked = pn.widgets.Checkbox(label="Show what the search finds with these values")
-        self._image = ColumnDataSource({"image": [], "dw": [], "dh": []})
-        self._rings = ColumnDataSource({"x": [], "y": [], "text": []})
-        self._grey = LinearColorMapper(palette=gray(256), low=0, high=1)
-        self._x, self._y = Range1d(0, 1), Range1d(1, 0)
-        self._plot = figure(
-            width=_SIDE_PX, height=_SIDE_PX, x_range=self._x, y_range=self._y, tools="",
-            toolbar_location=None, x_axis_label="x [px]", y_axis_label="y [px]",
-        )  # fmt: skip
-        self._plot.grid.visible = False
-        self._plot.image(
-            image="image", x=0, y=0, dw="dw", dh="dh", source=self._image, color_mapper=self._grey
-        )
-        self._plot.scatter(
-            "x", "y", source=self._rings, size=22, line_color="#F0E442", line_width=2,
-            fill_color=None,
-        )  # fmt: skip
-        self._plot.text(
-            "x", "y", text="text", source=self._rings, text_color="#F0E442", x_offset=12,
-            y_offset=-8, text_font_size="11px",
-        )  # fmt: skip
+        self._picture = Picture(_SIDE_PX)
+        self._picture.figure.toolbar_location = None
         self._said = pn.pane.HTML("", width=_SIDE_PX)
-        self._shown = pn.Column(pn.pane.Bokeh(self._plot), self._said, visible=False)
-        self.asked.param.watch(lambda _: self.follow(self._config), "value")
+        self._shown = pn.Column(pn.pane.Bokeh(self._picture.figure), self._said, visible=False)
+        self._notice.watch(lambda: self.follow(self._config), self.asked)
         self.body = pn.Column(self.asked, self._shown)
 
     def follow(self, config: ia.Config | None) -> None:
@@ -72,17 +54,11 @@ class DetectionPreview:
 
     def _show(self, look: ia.Look, found: pd.DataFrame) -> None:
         seen = look.image[np.isfinite(look.image)]
-        if seen.size:
-            low, high = np.quantile(seen, _ENDS)
-            self._grey.update(low=float(low), high=float(max(high, np.nextafter(low, math.inf))))
-        rows, columns = look.image.shape
-        self._x.end, self._y.start = columns, rows
-        self._image.data = {"image": [look.image], "dw": [columns], "dh": [rows]}
-        self._rings.data = {
-            "x": found["x_px"] + 0.5,
-            "y": found["y_px"] + 0.5,
-            "text": [f"{snr:.1f} σ" for snr in found["snr"]],
-        }
+        low, high = map(float, np.quantile(seen, _ENDS)) if seen.size else (0.0, 1.0)
+        self._picture.fit(*look.image.shape)
+        self._picture.show(look.image, low, max(high, math.nextafter(low, math.inf)))
+        places = found[["x_px", "y_px", "snr"]].itertuples(index=False)
+        self._picture.ring([(x, y, YELLOW, f"{snr:.1f} σ") for x, y, snr in places])
         first, stop = look.after
         self._said.object = (
             f"<p>{len(found)} above {look.threshold:.2f} times the noise, in frames {first} to "
@@ -103,15 +79,13 @@ FIRST = ("camera.pixel_size_nm", "optics.wavelength_nm", "optics.na", "particle.
 
 _ELSEWHERE = ("simulation", "bounds")  # sections that no analysis of a movie reads
 _UNSET = "(default)"
-_UNITS = {
-    "nm": "nm", "kda": "kDa", "deg": "°", "e": "photoelectrons", "ms": "ms", "hz": "Hz",
-    "frames": "frames", "adu": "counts", "mb": "MB", "c": "°C", "s": "mPa·s",
-}  # fmt: skip
+_UNITS = {"kda": "kDa", "deg": "°", "e": "photoelectrons", "hz": "Hz", "adu": "counts", "mb": "MB"}
+_UNITS |= {"c": "°C", "s": "mPa·s", "nm": "nm", "ms": "ms", "frames": "frames"}
 
 
 @dataclass(frozen=True)
 class Field:
-    """One key of the configuration, as its schema has it."""
+    """One key of the configuration."""
 
     key: str
     help: str
@@ -127,43 +101,27 @@ class Field:
 
 
 def fields() -> list[Field]:
-    """Read the keys out of the JSON schema of the configuration."""
-    whole = ia.Config.model_json_schema()
+    """List the keys of the configuration."""
     found = []
-    for section, reference in whole["properties"].items():
-        if section in _ELSEWHERE:
-            continue
-        for name, said in _resolved(reference, whole).get("properties", {}).items():
-            choices = _choices(_resolved(said, whole))
-            found.append(
-                Field(
-                    f"{section}.{name}", said.get("description", ""), said.get("default"), choices
-                )
-            )
+    for section, outer in ia.Config.model_fields.items():
+        kinds = (outer.annotation, *get_args(outer.annotation))  # a section may be absent
+        model = next(kind for kind in kinds if hasattr(kind, "model_fields"))
+        for name, field in model.model_fields.items() if section not in _ELSEWHERE else ():
+            about, default = field.description or "", field.get_default(call_default_factory=True)
+            found.append(Field(f"{section}.{name}", about, default, _choices(field.annotation)))
     return found
 
 
-def _resolved(said: Mapping[str, Any], whole: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Follow a reference into the schema's definitions."""
-    for each in (said, *said.get("anyOf", ())):
-        if "$ref" in each:
-            found: Mapping[str, Any] = whole["$defs"][each["$ref"].rpartition("/")[2]]
-            return found
-    return said
-
-
-def _choices(said: Mapping[str, Any]) -> tuple[Any, ...]:
+def _choices(annotation: Any) -> tuple[Any, ...]:
     """Give the values that a key may have, where these are few."""
-    kinds = [each for each in said.get("anyOf", [said]) if each.get("type") != "null"]
     found: list[Any] = []
-    for kind in kinds:
-        if "enum" in kind:
-            found += kind["enum"]
-        elif "const" in kind:
-            found.append(kind["const"])
-        elif kind.get("type") == "boolean":
+    united = get_origin(annotation) in (Union, UnionType)
+    for kind in get_args(annotation) if united else (annotation,):
+        if kind is bool:
             found += [True, False]
-        else:
+        elif get_origin(kind) is Literal:
+            found += get_args(kind)
+        elif kind is not NoneType:
             return ()
     return tuple(found)
 
@@ -187,25 +145,19 @@ class Form:
         self._complaint = pn.pane.HTML("", width=440, visible=False)
         self._preview = DetectionPreview(chosen, self._notice)
         self._taken = Taken(chosen, self._notice)
-        propose = pn.widgets.Button(label="Propose from the movie", width=190)
-        save = pn.widgets.Button(label="Save iscat.toml", color="primary", width=150)
-        propose.on_click(self._propose)
-        save.on_click(self._save)
+        save = self._notice.button("Save iscat.toml", 150, self._save, main=True)
+        propose = self._notice.button("Propose from the movie", 190, self._propose)
+        buttons = pn.Row(save, propose)
+        first = ("### What matters most", self._first, buttons, self._complaint, self._taken.body)
+        seen = (self._preview.body, "### The file", self._written)
         self.body = pn.Column(
             self._notice.pane,
             pn.FlexBox(
-                pn.Column(
-                    "### What matters most", self._first, pn.Row(save, propose),
-                    self._complaint, self._taken.body,
-                    width=480,
-                ),
+                pn.Column(*first, width=480),
                 pn.Column("### Everything else", self._rest, width=520),
-                pn.Column(
-                    self._preview.body, "### The file", self._written, width=420,
-                    margin=(0, 0, 0, 12),
-                ),
+                pn.Column(*seen, width=420, margin=(0, 0, 0, 12)),
             ),
-        )  # fmt: skip
+        )
 
     def refresh(self) -> None:
         """Show the configuration of the movie that is chosen."""
@@ -245,10 +197,11 @@ class Form:
         sections: dict[str, list[Any]] = {}
         for field in fields():
             widget = _widget_of(field)
-            widget.param.watch(lambda _: self._check(), "value")
+            self._notice.watch(self._check, widget)
             self._widgets[field.key] = widget
             wrong = self._warned[field.key] = pn.pane.HTML("", width=400, visible=False)
-            shown = pn.Column(widget, wrong, pn.pane.HTML(_help(field), width=400))
+            about = f"<small>{html.escape(field.help)}</small>"
+            shown = pn.Column(widget, wrong, pn.pane.HTML(about, width=400))
             if field.key in FIRST:
                 first[field.key] = shown
             else:
@@ -280,42 +233,29 @@ class Form:
         self._preview.follow(config)
 
     def _texts(self) -> dict[str, str]:
-        texts = {}
-        for key, widget in self._widgets.items():
-            text = str(widget.value).strip()
-            if text and text != _UNSET:
-                texts[key] = text
-        return texts
+        texts = {key: str(widget.value).strip() for key, widget in self._widgets.items()}
+        return {key: text for key, text in texts.items() if text not in ("", _UNSET)}
 
     def _others(self) -> dict[str, str]:
         """Give what is in the file and not in the form, which stays as it is."""
         texts = read_texts(self._chosen.config)
         return {key: text for key, text in texts.items() if key not in self._widgets}
 
-    def _save(self, _: Any) -> None:
-        path = self._chosen.setup
-        if path is None:
-            self._notice.say("Choose a movie under Open.", "error")
-            return
-        with self._notice.told():
-            config = write_texts(path, self._texts() | self._others())
-            self._chosen.span = self._chosen.excluded = None
-            self._chosen.changed += 1
-            self._notice.say(f"saved as {path}: mode {config.fit.mode}")
-            self._show_file()
+    def _save(self) -> None:
+        path = setup_beside(self._chosen.wanted_movie)
+        config = write_texts(path, self._texts() | self._others())
+        self._chosen.span = self._chosen.excluded = None
+        self._chosen.changed += 1
+        self._notice.say(f"saved as {path}: mode {config.fit.mode}")
+        self._show_file()
 
-    def _propose(self, _: Any) -> None:
+    def _propose(self) -> None:
         """Fill the form as `iscat init` would, with what the file and its noise say."""
-        movie, path = self._chosen.movie, self._chosen.setup
-        if movie is None or path is None:
-            self._notice.say("Choose a movie under Open.", "error")
-            return
-        texts = self._texts()
+        movie, texts = self._chosen.wanted_movie, self._texts()
         answers = {key: _number(texts[key]) for key in FIRST if key in texts and key != "fit.mode"}
+        how: Any = {"answers": answers, "out": setup_beside(movie), "overwrite": True}
         self._notice.work(
-            "Looking at the movie",
-            lambda: write_setup(movie, answers=answers, out=path, overwrite=True),
-            self._proposed,
+            "Looking at the movie", partial(write_setup, movie, **how), self._proposed
         )
 
     def _proposed(self, found: Setup) -> None:
@@ -334,8 +274,11 @@ def _widget_of(field: Field) -> Any:
     if field.choices:
         texts = [str(c).lower() if isinstance(c, bool) else str(c) for c in field.choices]
         return pn.widgets.Select(label=field.label, options=[_UNSET, *texts], width=380)
-    default = "" if field.default is None else _default(field.default)
-    return pn.widgets.TextInput(label=field.label, placeholder=default, width=380)
+    default = field.default
+    if default is not None and not hasattr(default, "model_fields"):
+        shown = list(default) if isinstance(default, tuple) else default
+        default = f"default {shown}"
+    return pn.widgets.TextInput(label=field.label, placeholder=str(default or ""), width=380)
 
 
 def _warn(pane: Any, text: str) -> None:
@@ -346,14 +289,6 @@ def _warn(pane: Any, text: str) -> None:
 def _names(said: str, key: str) -> bool:
     """Say whether a message is about a key."""
     return re.search(rf"(?<![\w.]){re.escape(key)}(?![\w.])", said.replace(": ", " ")) is not None
-
-
-def _default(value: Any) -> str:
-    return "" if isinstance(value, dict) else f"default {value}"
-
-
-def _help(field: Field) -> str:
-    return f"<small>{html.escape(field.help)}</small>"
 
 
 def _number(text: str) -> float | str:

@@ -11,8 +11,7 @@ import numpy as np
 import pandas as pd
 import panel as pn
 from bokeh.events import SelectionGeometry
-from bokeh.models import BoxAnnotation, BoxSelectTool, ColumnDataSource, PointDrawTool, TapTool
-from bokeh.plotting import figure
+from bokeh.models import BoxAnnotation, BoxSelectTool, PointDrawTool, TapTool
 
 import iscat_analysis as ia
 from iscat_analysis.answers.gates import (
@@ -21,6 +20,7 @@ from iscat_analysis.answers.gates import (
     counted_events,
     counted_rows,
     gate,
+    gate_rows,
     mass_histogram,
     usual_bin,
 )
@@ -28,7 +28,8 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.files import whole_file
 from iscat_analysis.species.describe import Branch
 from iscat_analysis.species.tables import EventTable
-from iscat_app.chosen import Chosen, Notice, in_line, link_to, masses_in, table_of
+from iscat_app import widgets as ui
+from iscat_app.chosen import Chosen, Notice, link_to, masses_in
 
 COLUMNS = ("event", "frame", "x_px", "y_px", "mass_kda", "rejected_at")
 """Columns of the list: what the event was, so that a new analysis does not reject another."""
@@ -83,7 +84,6 @@ class Rejections:
             self.rows.to_csv(partial, index=False)
 
 
-_BLUE, _GREY, _RED = "#0072B2", "#8A8F96", "#D55E00"
 _BRANCHES: dict[str, Branch] = {
     "landing and leaving": "magnitude",
     "landing": "landing",
@@ -94,17 +94,17 @@ _HINT = (
     "point tool moves, adds (click) and removes (Backspace) the diamonds of species, and so do the "
     "masses in the field. Species are of events that are ok.</small>"
 )
-_GATE_HEAD = (
-    "gate [kDa]",
-    "events",
-    "95 %",
-    "mean [kDa]",
-    "± SE",
-    "width [kDa]",
-    "fraction",
-    "95 %",
+_GATES = (
+    "gate [kDa] | events | 95 % | mean [kDa] | ± SE | width [kDa] | fraction | 95 %",
+    "{low_kda:g} to {high_kda:g} | {count} | {count_low:.1f} to {count_high:.1f} | "
+    "{mean_kda:.2f} | {mean_se:.2f} | {width_kda:.2f} | {fraction:.1f%} | "
+    "{fraction_low:.1f%} to {fraction_high:.1f%}",
 )
-_SPECIES_HEAD = ("species [kDa]", "95 %", "width [kDa]", "events", "fraction", "95 %")
+_SPECIES = (
+    "species [kDa] | 95 % | width [kDa] | events | fraction | 95 %",
+    "{mass_kda:.1f} | {mass_low:.1f} to {mass_high:.1f} | {width_kda:.1f} | {count:.1f} |"
+    " {fraction:.1f%} | {fraction_low:.1f%} to {fraction_high:.1f%}",
+)
 
 
 class Results:
@@ -131,33 +131,26 @@ class Results:
     # ---- figures ----------------------------------------------------------------------------
 
     def _make_figures(self) -> None:
-        self._bars = ColumnDataSource({"left": [], "right": [], "top": []})
-        self._curve = ColumnDataSource({"x": [], "y": []})
-        self._species_curve = ColumnDataSource({"x": [], "y": []})
-        self._handles = ColumnDataSource({"x": [], "y": []})
-        self._events = ColumnDataSource(
-            {name: [] for name in ("x", "y", "frame", "mass", "event", "colour")}
-        )
-        self._hist = figure(
-            width=620, height=330, tools="xwheel_zoom,xpan,reset,save", x_axis_label="|mass| [kDa]",
-            y_axis_label="events", active_drag=None,
-        )  # fmt: skip
-        bars = self._hist.quad(
-            left="left", right="right", top="top", bottom=0, source=self._bars, color=_GREY,
-            alpha=0.5, line_color="white", selection_color=_BLUE, nonselection_alpha=0.35,
-        )  # fmt: skip
-        self._hist.line("x", "y", source=self._curve, color=_BLUE, legend_label="kernel density")
-        self._hist.line(
-            "x", "y", source=self._species_curve, color=_RED, line_width=2, legend_label="species"
-        )
-        handles = self._hist.scatter(
-            "x", "y", source=self._handles, size=14, marker="diamond", color=_RED,
-            line_color="white", nonselection_alpha=1,
-        )  # fmt: skip
-        self._hist.add_tools(
-            PointDrawTool(renderers=[handles], description="move, add or remove species")
-        )
-        self._hist.toolbar.logo = None
+        self._bars = ui.source("left", "right", "top")
+        self._curve, self._species_curve = ui.source("x", "y"), ui.source("x", "y")
+        self._handles = ui.source("x", "y")
+        self._events = ui.source("x", "y", "frame", "mass", "event", "colour")
+        self._hist = ui.plot((620, 330), ("|mass| [kDa]", "events"), "xwheel_zoom,xpan,reset,save")
+        grey = {
+            "alpha": 0.5,
+            "nonselection_alpha": 0.35,
+            "selection_color": ui.BLUE,
+            "color": ui.GREY,
+        }
+        edges = {"left": "left", "right": "right", "top": "top", "bottom": 0}
+        bars = self._hist.quad(**edges, source=self._bars, line_color="white", **grey)
+        self._hist.line("x", "y", source=self._curve, color=ui.BLUE, legend_label="kernel density")
+        red = {"color": ui.RED, "line_width": 2, "legend_label": "species"}
+        self._hist.line("x", "y", source=self._species_curve, **red)
+        diamond = {"marker": "diamond", "size": 14, "color": ui.RED, "nonselection_alpha": 1}
+        handles = self._hist.scatter("x", "y", source=self._handles, line_color="white", **diamond)
+        about = "move, add or remove species"
+        self._hist.add_tools(PointDrawTool(renderers=[handles], description=about))
         legend = self._hist.legend[0]
         legend.update(orientation="horizontal", border_line_color=None, padding=2)
         self._hist.add_layout(legend, "above")
@@ -167,74 +160,56 @@ class Results:
         self._hist.on_event(SelectionGeometry, self._dragged)
         self._hist.y_range.start = 0
         self._bars.selected.on_change("indices", self._bar_clicked)
-        self._map = figure(
-            width=310, height=300, tools="pan,wheel_zoom,box_select,tap,reset",
-            x_axis_label="x [px]", y_axis_label="y [px]", match_aspect=True,
-        )  # fmt: skip
-        self._map.y_range.flipped = True
-        self._course = figure(
-            width=310, height=300, tools="pan,wheel_zoom,box_select,tap,reset",
-            x_axis_label="frame", y_axis_label="mass [kDa]",
-        )  # fmt: skip
-        self._map.toolbar.logo = self._course.toolbar.logo = None
-        for plot, x, y in ((self._map, "x", "y"), (self._course, "frame", "mass")):
-            plot.scatter(
-                x, y, source=self._events, size=6, color="colour", selection_line_color="black",
-                nonselection_alpha=0.25,
-            )  # fmt: skip
+        tools = "pan,wheel_zoom,box_select,tap,reset"
+        self._map = ui.plot((310, 300), ("x [px]", "y [px]"), tools)
+        self._map.match_aspect = self._map.y_range.flipped = True
+        self._course = ui.plot((310, 300), ("frame", "mass [kDa]"), tools)
+        dot = {"size": 6, "selection_line_color": "black", "nonselection_alpha": 0.25}
+        for shown, x, y in ((self._map, "x", "y"), (self._course, "frame", "mass")):
+            shown.scatter(x, y, source=self._events, color="colour", **dot)
         self._events.selected.on_change("indices", self._events_selected)
 
     def _make_widgets(self) -> None:
-        self.bin = pn.widgets.FloatInput(
-            label="Bar width [kDa]", value=10.0, start=0.01, step=1.0, width=110
-        )
-        self.kernel = pn.widgets.FloatInput(
-            label="Kernel [kDa]", value=10.0, start=0.01, step=1.0, width=110
-        )
-        self.branch = pn.widgets.Select(label="Events", options=[*_BRANCHES], width=190)
+        select = pn.widgets.Select
+        self.bin = ui.number("Bar width [kDa]", 10.0, 110, start=0.01)
+        self.kernel = ui.number("Kernel [kDa]", 10.0, 110, start=0.01)
+        self.branch = select(label="Events", options=[*_BRANCHES], width=190)
         self.flagged = pn.widgets.Checkbox(label="flagged too")
-        self.find = pn.widgets.Button(label="Find the species", width=140)
-        self.refit = pn.widgets.Button(label="Fit again from the diamonds", width=210)
-        self.begin = pn.widgets.TextInput(
-            label="Species begin at [kDa]", placeholder="66, 146", width=300
+        self.find = self._notice.button("Find the species", 140, lambda: self._find_species(None))
+        again = "Fit again from the diamonds"
+        self.refit = self._notice.button(again, 210, lambda: self._find_species(self._means()))
+        begin = {"label": "Species begin at [kDa]", "placeholder": "66, 146", "width": 300}
+        self.begin = pn.widgets.TextInput(**begin)
+        self.low = ui.number("Gate from [kDa]", 0.0, 100)
+        self.high = ui.number("to [kDa]", 100.0, 100)
+        gates = (
+            self._notice.button("Add the gate", 100, lambda: self._add_gate(*self._ends())),
+            self._notice.button("Select its events", 120, lambda: self._select(*self._ends())),
+            self._notice.button("Remove all gates", 125, lambda: self._set_gates([])),
         )
-        self.low = pn.widgets.FloatInput(label="Gate from [kDa]", value=0.0, width=100)
-        self.high = pn.widgets.FloatInput(label="to [kDa]", value=100.0, width=100)
-        add = pn.widgets.Button(label="Add the gate", width=100)
-        drop = pn.widgets.Button(label="Remove all gates", width=125)
-        pick = pn.widgets.Button(label="Select its events", width=120)
         self._report = pn.pane.HTML("")
-        self._gate_table = pn.pane.HTML("", sizing_mode="stretch_width")
-        self._species_table = pn.pane.HTML("", sizing_mode="stretch_width")
-        self.which = pn.widgets.Select(label="Selected events", options=[], size=7, width=230)
+        self._gate_table, self._species_table = ui.wide_pane(), ui.wide_pane()
+        self.which = select(label="Selected events", options=[], size=7, width=230)
         self._facts = pn.pane.HTML("", width=300)
-        self._picture = pn.pane.PNG(
-            None, width=560, alt_text="data, model and residual of the event"
-        )
-        reject = pn.widgets.Button(label="Reject the selected events", width=190)
-        self.listed = pn.widgets.Select(label="Rejected by hand", options=[], size=5, width=230)
-        back = pn.widgets.Button(label="Take the event back", width=160)
-        for widget in (self.bin, self.kernel, self.branch, self.flagged):
-            widget.param.watch(lambda _: self._draw(), "value")
-        self.begin.param.watch(self._begin_typed, "value")
+        about = "data, model and residual of the event"
+        self._picture = pn.pane.PNG(None, width=560, alt_text=about)
+        reject = self._notice.button("Reject the selected events", 190, self._reject)
+        self.listed = select(label="Rejected by hand", options=[], size=5, width=230)
+        back = self._notice.button("Take the event back", 160, self._take_back)
+        self._notice.watch(self._draw, self.bin, self.kernel, self.branch, self.flagged)
+        self._notice.watch(self._begin_typed, self.begin)
+        self._notice.watch(self._show_event, self.which)
         self._handles.on_change("data", self._write_means)
-        self.find.on_click(lambda _: self._find_species(None))
-        self.refit.on_click(lambda _: self._find_species(self._means()))
-        add.on_click(lambda _: self._add_gate(*self._ends()))
-        pick.on_click(lambda _: self._select(*self._ends()))
-        drop.on_click(lambda _: self._set_gates([]))
-        reject.on_click(self._reject)
-        back.on_click(self._take_back)
-        self.which.param.watch(self._show_event, "value")
+        counted = (self.bin, self.kernel, self.branch, self.flagged, self.find, self._report)
         self.body = pn.Column(
             self._notice.pane,
-            in_line(self.bin, self.kernel, self.branch, self.flagged, self.find, self._report),
+            ui.in_line(*counted),
             pn.FlexBox(
                 pn.Column(
                     pn.pane.Bokeh(self._hist),
                     pn.pane.HTML(_HINT),
-                    in_line(self.low, self.high, add, pick, drop),
-                    in_line(self.begin, self.refit),
+                    ui.in_line(self.low, self.high, *gates),
+                    ui.in_line(self.begin, self.refit),
                     self._gate_table,
                     self._species_table,
                     pn.Row(pn.pane.Bokeh(self._map), pn.pane.Bokeh(self._course)),
@@ -305,15 +280,10 @@ class Results:
             self._curve.data = {"x": seen.mass_kda, "y": seen.density}
             self._hist.yaxis.axis_label = f"events per {seen.bin_kda:g} kDa"
             self._draw_species()
-            place = {
-                "x": "x_px",
-                "y": "y_px",
-                "frame": "frame",
-                "mass": "mass_kda",
-                "event": "event",
-            }
+            place = {"x": "x_px", "y": "y_px", "frame": "frame", "mass": "mass_kda"}
+            place["event"] = "event"
             data = {name: self._seen[column].to_numpy() for name, column in place.items()}
-            data["colour"] = np.where(self._seen["status"] == "ok", _BLUE, "#E69F00")
+            data["colour"] = np.where(self._seen["status"] == "ok", ui.BLUE, ui.ORANGE)
             self._events.selected.indices = []
             self._events.data = data
             self._set_gates([(g.low_kda, g.high_kda) for g in self.gates])
@@ -337,21 +307,11 @@ class Results:
         with self._notice.told():
             self.gates = [gate(self.masses(), low, high) for low, high in sorted(ends)]
         kept = [r for r in self._hist.center if not isinstance(r, BoxAnnotation)]
-        boxes = [
-            BoxAnnotation(left=g.low_kda, right=g.high_kda, fill_alpha=0.12, fill_color=_BLUE)
-            for g in self.gates
-        ]
+        look = {"fill_alpha": 0.12, "fill_color": ui.BLUE}
+        ends_of = [(each.low_kda, each.high_kda) for each in self.gates]
+        boxes = [BoxAnnotation(left=low, right=high, **look) for low, high in ends_of]
         self._hist.center = [*kept, *boxes]
-        rows = [
-            (
-                f"{g.low_kda:g} to {g.high_kda:g}", str(g.count),
-                f"{g.count_low:.1f} to {g.count_high:.1f}", f"{g.mean_kda:.2f}", f"{g.mean_se:.2f}",
-                f"{g.width_kda:.2f}", f"{g.fraction:.1%}",
-                f"{g.fraction_low:.1%} to {g.fraction_high:.1%}",
-            )
-            for g in self.gates
-        ]  # fmt: skip
-        self._gate_table.object = table_of(rows, _GATE_HEAD) if rows else ""
+        self._gate_table.object = ui.listing(gate_rows(self.gates), *_GATES) if self.gates else ""
 
     # ---- species ----------------------------------------------------------------------------
 
@@ -359,18 +319,16 @@ class Results:
         """Give the masses at which somebody left the diamonds."""
         return sorted({round(float(x), 2) for x in self._handles.data["x"] if x > 0})
 
-    def _write_means(self, attr: str, old: Any, new: Any) -> None:
-        del attr, old, new
+    def _write_means(self, _attr: str, _old: Any, _new: Any) -> None:
         self.begin.value = ", ".join(f"{mass:g}" for mass in self._means())
 
-    def _begin_typed(self, event: Any) -> None:
+    def _begin_typed(self) -> None:
         """Put the diamonds where somebody writes."""
-        with self._notice.told():
-            masses = sorted(masses_in(event.new))
-            if masses != self._means():
-                curve = self.species_curve()
-                height = np.interp(masses, *curve) if curve else np.zeros(len(masses))
-                self._handles.data = {"x": np.array(masses), "y": height}
+        masses = sorted(masses_in(self.begin.value))
+        if masses != self._means():
+            curve = self.species_curve()
+            height = np.interp(masses, *curve) if curve else np.zeros(len(masses))
+            self._handles.data = {"x": np.array(masses), "y": height}
 
     def events(self) -> EventTable:
         """Give the events that count, with what the search of the whole result missed."""
@@ -389,13 +347,12 @@ class Results:
         if start is not None and not start:
             self._notice.say("Find the species first, or give masses to begin at.")
         elif len(seen):
-            with self._notice.told():
-                events = self.events()
-                self._notice.work(
-                    "Finding species",
-                    lambda: ia.find_species(events, start_kda=start, branch=branch),
-                    lambda found: self._take_species(found, seen, start),
-                )
+            events = self.events()
+            self._notice.work(
+                "Finding species",
+                lambda: ia.find_species(events, start_kda=start, branch=branch),
+                lambda found: self._take_species(found, seen, start),
+            )
 
     def _take_species(
         self, found: ia.Distribution, seen: pd.DataFrame, start: list[float] | None
@@ -420,21 +377,12 @@ class Results:
         self._species_curve.data = {"x": found[0], "y": found[1]}
         means = self.species.species["mass_kda"].dropna().to_numpy(float)
         self._handles.data = {"x": means, "y": np.interp(means, *found)}
-        rows = [
-            (
-                f"{s['mass_kda']:.1f}", f"{s['mass_low']:.1f} to {s['mass_high']:.1f}",
-                f"{s['width_kda']:.1f}", f"{s['count']:.1f}", f"{s['fraction']:.1%}",
-                f"{s['fraction_low']:.1%} to {s['fraction_high']:.1%}",
-            )
-            for s in self.species.species.to_dict("records")
-        ]  # fmt: skip
-        notes = [(f"{note}.",) for note in self.species.notes]
-        self._species_table.object = table_of(rows, _SPECIES_HEAD) + table_of(notes)
+        rows = ui.listing(self.species.species.to_dict("records"), *_SPECIES)
+        self._species_table.object = rows + ui.lines(f"{note}." for note in self.species.notes)
 
     # ---- single events ----------------------------------------------------------------------
 
-    def _bar_clicked(self, attr: str, old: Any, new: list[int]) -> None:
-        del attr, old
+    def _bar_clicked(self, _attr: str, _old: Any, new: list[int]) -> None:
         if self.histogram is None or not new:
             return
         edges, mass = self.histogram.edges, self.masses()
@@ -448,46 +396,42 @@ class Results:
         mass = self.masses()
         self._events.selected.indices = np.flatnonzero((mass >= low) & (mass < high)).tolist()
 
-    def _events_selected(self, attr: str, old: Any, new: list[int]) -> None:
-        del attr, old
+    def _events_selected(self, _attr: str, _old: Any, new: list[int]) -> None:
         options = {
             f"{row['event']}: {row['mass_kda']:.1f} kDa, {row['status']}": int(row["event"])
             for row in self._seen.iloc[new].to_dict("records")
         }
         self.which.param.update(options=options, value=next(iter(options.values()), None))
 
-    def _show_event(self, event: Any) -> None:
+    def _show_event(self) -> None:
         """Show the numbers of an event, and then its pictures, which are made of the movie."""
-        result, number = self.result, event.new
-        if result is None or number is None:
+        result, event = self.result, self.which.value
+        if result is None or event is None:
             self._facts.object, self._picture.object = "", None
             return
-        row = int(np.flatnonzero(self.table["event"] == number)[0])
-        self._facts.object = table_of(result.facts(row))
+        row = int(np.flatnonzero(self.table["event"] == event)[0])
+        self._facts.object = ui.table_of(result.facts(row))
         # where the film goes, and what it rings
-        self._chosen.param.update(frame=int(self.table["frame"].iloc[row]), event=int(number))
+        self._chosen.param.update(frame=int(self.table["frame"].iloc[row]), event=int(event))
         self._notice.work(
-            "Drawing the event", lambda: _png(result, row), lambda png: self._take(png, number)
+            "Drawing the event", lambda: _png(result, row), lambda png: self._take(png, event)
         )
 
-    def _take(self, picture: bytes, number: int) -> None:
-        if self.which.value == number:
+    def _take(self, picture: bytes, event: int) -> None:
+        if self.which.value == event:
             self._picture.object = picture
 
-    def _reject(self, _: Any) -> None:
+    def _reject(self) -> None:
         chosen = self._events.selected.indices
         if not chosen or self.rejections is None:
-            self._notice.say("Select events first: click a bar, or a dot.")
-            return
-        with self._notice.told():
-            self.rejections.reject(self._seen.iloc[chosen])
-            self._rejected_anew()
+            raise DataError("Select events first: click a bar, or a dot.")
+        self.rejections.reject(self._seen.iloc[chosen])
+        self._rejected_anew()
 
-    def _take_back(self, _: Any) -> None:
+    def _take_back(self) -> None:
         if self.rejections is not None and self.listed.value is not None:
-            with self._notice.told():
-                self.rejections.take_back({self.listed.value})
-                self._rejected_anew()
+            self.rejections.take_back({self.listed.value})
+            self._rejected_anew()
 
     def _rejected_anew(self) -> None:
         if self.rejections is not None:

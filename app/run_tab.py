@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import html
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import panel as pn
 
 from iscat_analysis.movie import path_beside
-from iscat_app.chosen import Chosen, Notice, in_line
+from iscat_app.chosen import Chosen, Notice
 from iscat_app.files import listed
 from iscat_app.runs import Job, Queue, Run
+from iscat_app.widgets import in_line
 
 
 class RunTab:
@@ -24,19 +26,14 @@ class RunTab:
         self._version, self._ended = -1, set[int]()
         self._notice = Notice()
         self._overwrite = pn.widgets.Checkbox(label="Replace an earlier result")
-        self._scheduler = pn.widgets.TextInput(
-            label="Where: threads, or the address of a Dask scheduler", value="threads", width=330
-        )
-        start = pn.widgets.Button(label="Analyse this movie", color="primary", width=170)
-        every = pn.widgets.Button(label="Analyse all movies of the folder", width=240)
+        where = "Where: threads, or the address of a Dask scheduler"
+        self._scheduler = pn.widgets.TextInput(label=where, value="threads", width=330)
+        start = self._notice.button("Analyse this movie", 170, self._start, main=True)
+        every = self._notice.button("Analyse all movies of the folder", 240, self._start_all)
         self._which = pn.widgets.Select(label="Run", options=[], width=420)
-        stop = pn.widgets.Button(label="Stop", width=90)
-        again = pn.widgets.Button(label="Go on or try again", width=160)
-        start.on_click(self._start)
-        every.on_click(self._start_all)
-        stop.on_click(lambda _: self._do(self._queue.stop))
-        again.on_click(lambda _: self._do(self._queue.again))
-        self._which.param.watch(lambda _: self._show(), "value")
+        stop = self._notice.button("Stop", 90, lambda: self._do(self._queue.stop))
+        again = self._notice.button("Go on or try again", 160, lambda: self._do(self._queue.again))
+        self._notice.watch(self._show, self._which)
         self._bar = pn.indicators.Progress(value=0, max=100, width=420)
         self._state = pn.pane.HTML("")
         self._log = pn.pane.Str("", sizing_mode="stretch_width")
@@ -97,35 +94,26 @@ class RunTab:
         self._state.object = f"<p role='status'>{', '.join(parts)}</p>"
         self._log.object = "\n".join([f"$ {run.job.command}", *run.log])
 
-    def _start(self, _: Any) -> None:
-        movie = self._chosen.movie
-        if movie is None:
-            self._notice.say("Choose a movie under Open.", "error")
-            return
+    def _start(self) -> None:
+        movie = self._chosen.wanted_movie
         self._notice.say("")
         run = self._queue.add(self._job(movie))
         self.refresh()
         self._which.value = run.number
 
     def _job(self, movie: Path) -> Job:
-        return Job(
-            movie, self._chosen.config, path_beside(movie, ".iscat"),
-            overwrite=self._overwrite.value, scheduler=self._scheduler.value.strip() or "threads",
-        )  # fmt: skip
+        job = Job(movie, self._chosen.config, path_beside(movie, ".iscat"))
+        scheduler = self._scheduler.value.strip() or "threads"
+        return replace(job, overwrite=self._overwrite.value, scheduler=scheduler)
 
-    def _start_all(self, _: Any) -> None:
+    def _start_all(self) -> None:
         """Put all movies of the folder into the queue, but those that have a result."""
-        movie = self._chosen.movie
-        if movie is None:
-            self._notice.say("Choose a movie of the folder under Open.", "error")
-            return
         put = 0
-        for entry in listed(movie.parent):
-            if entry.kind == "movie":
-                out = path_beside(entry.path, ".iscat")
-                if self._overwrite.value or not (out / "summary.json").is_file():
-                    self._queue.add(self._job(entry.path))
-                    put += 1
+        for entry in listed(self._chosen.wanted_movie.parent):
+            done = (path_beside(entry.path, ".iscat") / "summary.json").is_file()
+            if entry.kind == "movie" and (self._overwrite.value or not done):
+                self._queue.add(self._job(entry.path))
+                put += 1
         self._notice.say(f"{put} movies are in the queue; those with a result were left alone")
         self.refresh()
 

@@ -10,7 +10,7 @@ import shlex
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
@@ -18,10 +18,9 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from multiprocessing.resource_tracker import ensure_running
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal
 
-if TYPE_CHECKING:
-    from iscat_analysis.records import Progress
+from iscat_analysis.options import Told
 
 State = Literal["waiting", "running", "stopping", "done", "stopped", "failed"]
 
@@ -45,19 +44,15 @@ class Job:
     @property
     def title(self) -> str:
         """Name what is done."""
-        what = {"fit": "", "camera": "camera of ", "optics": "optics of ", "day": "all of "}
-        return f"{what[self.kind]}{self.movie.name}"
+        what = {"camera": "camera of ", "optics": "optics of ", "day": "all of "}
+        return f"{what.get(self.kind, '')}{self.movie.name}"
 
     @property
     def command(self) -> str:
         """The command line that does the same."""
-        command = {
-            "fit": ["iscat-fit"],
-            "camera": ["iscat", "calibrate", "camera"],
-            "optics": ["iscat", "calibrate", "optics"],
-            "day": ["iscat", "batch"],
-        }
-        words = [*command[self.kind], str(self.movie)]
+        calibrate = {kind: f"iscat calibrate {kind}" for kind in ("camera", "optics")}
+        program = calibrate | {"fit": "iscat-fit", "day": "iscat batch"}
+        words = [*program[self.kind].split(), str(self.movie)]
         words += ["--dark", str(self.dark)] if self.dark else []
         words += ["--config", str(self.config)] if self.config and self.kind != "camera" else []
         words += ["--scheduler", self.scheduler] if self.scheduler != "threads" else []
@@ -232,7 +227,7 @@ def _work_on(job: Job, to: Connection) -> None:
         if hasattr(signal, "pthread_sigmask"):
             signal.pthread_sigmask(signal.SIG_SETMASK, ())
         try:
-            to.send(("done", _WORK[job.kind](job, progress, notify)))
+            to.send(("done", _WORK[job.kind](job, {"progress": progress, "notify": notify})))
         except IscatError as error:
             to.send(("failed", str(error)))
         except (OSError, MemoryError) as error:
@@ -241,55 +236,46 @@ def _work_on(job: Job, to: Connection) -> None:
         to.send(("stopped", str(stop) or "stopped; what was finished is kept"))
 
 
-def _fit(job: Job, progress: Progress, notify: Callable[[str], None]) -> str:
+def _fit(job: Job, told: Told) -> str:
     from iscat_analysis.config import load_config
     from iscat_analysis.executors import open_executor
     from iscat_analysis.pipeline import fit_stack
 
     config = load_config(job.config)
+    how: Any = {"overwrite": job.overwrite, "command": job.command}
     with open_executor(job.scheduler) as executor:
-        analysis = fit_stack(
-            job.movie, config, out=job.out, overwrite=job.overwrite, progress=progress,
-            notify=notify, command=job.command, executor=executor,
-        )  # fmt: skip
+        analysis = fit_stack(job.movie, config, out=job.out, executor=executor, **how, **told)
     return f"{len(analysis.table)} rows; results in {job.out}"
 
 
-def _camera(job: Job, progress: Progress, notify: Callable[[str], None]) -> str:
+def _camera(job: Job, told: Told) -> str:
     from iscat_analysis.answers.calibrations import camera_calibration
 
-    camera_calibration(
-        [job.movie], job.out, dark=job.dark, overwrite=job.overwrite, progress=progress,
-        notify=notify,
-    )  # fmt: skip
+    camera_calibration([job.movie], job.out, dark=job.dark, overwrite=job.overwrite, **told)
     return f"the camera is in {job.out}"
 
 
-def _optics(job: Job, progress: Progress, notify: Callable[[str], None]) -> str:
+def _optics(job: Job, told: Told) -> str:
     from iscat_analysis.answers.calibrations import optics_calibration
     from iscat_analysis.config import load_config
     from iscat_analysis.errors import DataError
 
-    found = optics_calibration(
-        job.movie, load_config(job.config), job.out, overwrite=job.overwrite, progress=progress,
-        notify=notify,
-    )  # fmt: skip
+    config = load_config(job.config)
+    found = optics_calibration(job.movie, config, job.out, overwrite=job.overwrite, **told)
     if not found.accepted:
         raise DataError(f"the optics are refused: {'; '.join(found.measured.refusals)}")
     return f"the optics are in {job.out}"
 
 
-def _day(job: Job, progress: Progress, notify: Callable[[str], None]) -> str:
+def _day(job: Job, told: Told) -> str:
     from iscat_analysis.day import batch
     from iscat_analysis.day.table import TABLES
 
     table = next((job.movie / name for name in TABLES if (job.movie / name).is_file()), job.movie)
-    found = batch(
-        table, out=job.out, config=job.config, scheduler=job.scheduler, progress=progress,
-        notify=notify, command=job.command,
-    )  # fmt: skip
+    how: Any = {"config": job.config, "scheduler": job.scheduler, "command": job.command}
+    found = batch(table, out=job.out, **how, **told)
     for name, why in found.failed:
-        notify(f"{name}: {why}")
+        told["notify"](f"{name}: {why}")
     return f"{len(found.movies)} movies; the page is {found.page}"
 
 

@@ -79,10 +79,9 @@ def page_of(folder: Path, queue: Queue) -> Any:
     start = folder if chosen.movie is None else chosen.movie.parent
     dark = _given("theme") == "dark"
     results, runs, compare = Results(chosen), RunTab(chosen, queue), Compare(chosen, queue)
-    parts: list[Part] = [
-        Files(chosen, start), Film(chosen), Form(chosen), runs, results, compare,
-        Calibrate(chosen, queue), Bounds(chosen), Export(chosen, results, compare),
-    ]  # fmt: skip
+    first: list[Part] = [Files(chosen, start), Film(chosen), Form(chosen), runs, results, compare]
+    last: list[Part] = [Calibrate(chosen, queue), Bounds(chosen), Export(chosen, results, compare)]
+    parts = first + last
     # Filled when first opened, for speed, and kept: what the browser says of a list that the server
     # has taken away is lost without a word, as it would be of `dynamic` tabs.
     places = [pn.Column(sizing_mode="stretch_width") for _ in parts]
@@ -112,9 +111,13 @@ def page_of(folder: Path, queue: Queue) -> Any:
     chosen.param.watch(show, ["movie", "result", "changed"])
     chosen.param.watch(remember, ["movie"])
     template = _Template(
-        title="iSCAT analysis", main=[heading, tabs], header=[colours, pn.pane.HTML(_KEYS)],
-        header_background="#1B1D21", theme="dark" if dark else "default", busy_indicator=None,
-    )  # fmt: skip
+        title="iSCAT analysis",
+        main=[heading, tabs],
+        header=[colours, pn.pane.HTML(_KEYS)],
+        header_background="#1B1D21",
+        theme="dark" if dark else "default",
+        busy_indicator=None,
+    )
     show()
     runs.watch()
     return template
@@ -225,6 +228,15 @@ class _Log(logging.Handler):
             self._warn(f"unexpected {type(error).__name__}: {error}; --debug gives the traceback")
 
 
+class _Locked(RequestHandler):
+    """Says what is missing."""
+
+    def get(self, *_: Any) -> None:
+        """Answer whoever has no token."""
+        self.set_status(403)
+        self.finish(_LOCKED)
+
+
 class _Token(AuthProvider):
     """Lets in who has the token, in the address or, from then on, in a cookie."""
 
@@ -246,38 +258,8 @@ class _Token(AuthProvider):
     def _is_token(self, given: str) -> bool:
         return secrets.compare_digest(given.encode(), self._token.encode())
 
-    @property
-    def get_user_async(self) -> None:
-        return None
-
-    @property
-    def login_url(self) -> str:
-        return "/locked"
-
-    @property
-    def get_login_url(self) -> None:
-        return None
-
-    @property
-    def login_handler(self) -> type[RequestHandler]:
-        return _Locked
-
-    @property
-    def logout_url(self) -> None:
-        return None
-
-    @property
-    def logout_handler(self) -> None:
-        return None
-
-
-class _Locked(RequestHandler):
-    """Says what is missing."""
-
-    def get(self, *_: Any) -> None:
-        """Answer whoever has no token."""
-        self.set_status(403)
-        self.finish(_LOCKED)
+    login_url, login_handler = "/locked", _Locked
+    get_user_async = get_login_url = logout_url = logout_handler = None
 
 
 class _Page(RequestHandler):

@@ -13,7 +13,9 @@ import iscat_analysis as ia
 from iscat_analysis.config import parse_config, toml_value
 from iscat_analysis.errors import DataError
 from iscat_analysis.files import whole_file
-from iscat_app.chosen import Chosen, Notice, in_line
+from iscat_analysis.movie import setup_beside
+from iscat_app.chosen import Chosen, Notice
+from iscat_app.widgets import in_line
 
 
 def read_texts(path: Path | None) -> dict[str, str]:
@@ -84,11 +86,11 @@ def add_table(path: Path, section: str, toml: str) -> None:
     write_texts(path, kept | {f"{section}.{name}": toml_text(v) for name, v in new.items()})
 
 
-_KINDS = {
-    "camera": ("*.camera/camera.toml", "camera"),
-    "optics": ("*.optics/optics.toml", "optics"),
-    "mass": ("*.calibration/calibration.toml", "line of the masses"),
-}
+_KINDS = (
+    ("*.camera/camera.toml", "camera"),
+    ("*.optics/optics.toml", "optics"),
+    ("*.calibration/calibration.toml", "line of the masses"),
+)
 """Where calibrations are, and what they are called."""
 
 
@@ -96,7 +98,7 @@ def beside(folder: Path) -> dict[str, str]:
     """List the calibrations of a folder by what they are."""
     return {
         f"{name}: {path.parent.stem}": str(path)
-        for pattern, name in _KINDS.values()
+        for pattern, name in _KINDS
         for path in sorted(folder.glob(pattern))
     }
 
@@ -111,15 +113,15 @@ def take(calibration: Path, setup: Path) -> str:
         values: dict[str, Any] = tomllib.loads(text)
     except (OSError, ValueError) as error:
         raise DataError(f"{calibration}: cannot be read ({error}); calibrate again") from None
-    if calibration.name == "camera.toml":
-        folder = calibration.parent.resolve()
-        _put(setup, {
-            f"camera.{key}": toml_text(str(folder / value) if isinstance(value, str) else value)
-            for key, value in values["camera"].items()
-        })  # fmt: skip
-        return f"[camera] of {setup} has gain, offset and read noise of {calibration}"
-    add_table(setup, "calibration", text)
-    return f"[calibration] of {setup} is the line of {calibration}; analyse anew to use it"
+    if calibration.name != "camera.toml":
+        add_table(setup, "calibration", text)
+        return f"[calibration] of {setup} is the line of {calibration}; analyse anew to use it"
+    folder = calibration.parent.resolve()
+    for key, value in values["camera"].items():
+        placed = str(folder / value) if isinstance(value, str) else value
+        values["camera"][key] = toml_text(placed)
+    _put(setup, {f"camera.{key}": value for key, value in values["camera"].items()})
+    return f"[camera] of {setup} has gain, offset and read noise of {calibration}"
 
 
 def _put(setup: Path, texts: dict[str, str]) -> None:
@@ -132,8 +134,7 @@ class Taken:
     def __init__(self, chosen: Chosen, notice: Notice) -> None:
         self._chosen, self._notice = chosen, notice
         self._list = pn.widgets.Select(label="Calibrations beside the movie", width=280)
-        self._use = pn.widgets.Button(label="Put it into iscat.toml", width=170)
-        self._use.on_click(self._take)
+        self._use = notice.button("Put it into iscat.toml", 170, self._take)
         self.body = in_line(self._list, self._use)
 
     def refresh(self) -> None:
@@ -147,12 +148,9 @@ class Taken:
             self._list.param.update(options=found, value=last)
         self._use.disabled = not found
 
-    def _take(self, _: Any) -> None:
-        setup = self._chosen.setup
-        if setup is None or not self._list.value:
-            self._notice.say("Choose a movie under Open, and a calibration.", "error")
-            return
-        with self._notice.told():
-            said = take(Path(self._list.value), setup)
-            self._chosen.changed += 1
-            self._notice.say(said)
+    def _take(self) -> None:
+        if not self._list.value:
+            raise DataError("Choose a calibration first.")
+        said = take(Path(self._list.value), setup_beside(self._chosen.wanted_movie))
+        self._chosen.changed += 1
+        self._notice.say(said)

@@ -9,6 +9,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from importlib.metadata import version
 from typing import Annotated, Any
 
@@ -30,21 +31,8 @@ from iscat_cli.species import species
 from iscat_cli.study import SUMMARY as CHALLENGE_SUMMARY
 from iscat_cli.study import benchmark, make, score, simulate
 
-COMMANDS = (
-    init,
-    fit,
-    batch,
-    watch,
-    simulate,
-    bounds,
-    benchmark,
-    species,
-    kd,
-    export,
-    view,
-    app,
-    config,
-)
+_MOVIES, _ANSWERS = (init, fit, batch, watch, simulate), (bounds, benchmark, species, kd)
+COMMANDS = (*_MOVIES, *_ANSWERS, export, view, app, config)
 GROUPS = (
     ("calibrate", CALIBRATE_SUMMARY, (camera, optics, mass)),
     ("challenge", CHALLENGE_SUMMARY, (make, score)),
@@ -58,30 +46,39 @@ STRICT = "--strict"
 def run(program: str, arguments: Sequence[str]) -> int:
     """Run one of the two programs."""
     given = list(arguments)
-    if program == "iscat-fit":
-        app = _empty()
-        _add(app, [replace(fit, example=fit.example.replace("iscat fit", "iscat-fit"))])
-    else:
-        app = _umbrella()
-        if not given or (len(given) == 1 and given[0] in [name for name, _, _ in GROUPS]):
-            given.append("--help")
-    return _run(app, program, given)
+    groups = [[name] for name, _, _ in GROUPS]
+    if program == "iscat" and given in ([], *groups):
+        given.append("--help")
+    return _run(_command_of(program), program, given)
+
+
+@cache
+def _command_of(program: str) -> Any:
+    """Make the command of a program, once for all runs of a process."""
+    if program == "iscat":
+        return typer.main.get_command(_umbrella())
+    alone = replace(fit, example=fit.example.replace("iscat fit", "iscat-fit"))
+    return typer.main.get_command(_of([alone]))
 
 
 def _umbrella() -> typer.Typer:
-    app = _empty()
+    app = _of(COMMANDS)
     app.callback()(_iscat)
-    _add(app, COMMANDS)
     for name, summary, commands in GROUPS:
-        group = _empty()
-        _add(group, commands)
-        app.add_typer(group, name=name, help=summary)
+        app.add_typer(_of(commands), name=name, help=summary)
     return app
 
 
-def _add(app: typer.Typer, commands: Sequence[Command]) -> None:
+def _of(commands: Sequence[Command]) -> typer.Typer:
+    """Make a program of commands."""
+    app = typer.Typer(
+        context_settings={"help_option_names": ["-h", "--help"]},
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+    )
     for each in commands:
         app.command(cls=Parsed, epilog=_as_written(each.example), short_help=each.summary)(each.run)
+    return app
 
 
 class Parsed(TyperCommand):
@@ -92,23 +89,13 @@ class Parsed(TyperCommand):
         args = [f"{STRICT}=" if text == STRICT else text for text in args]
         if not ctx.resilient_parsing:  # of completion, which has half a command
             given, _, order = self.make_parser(ctx).parse_args(args=list(args))
-            for option in order:
-                repeated = getattr(option, "multiple", True) or option.nargs != 1
-                if not repeated and order.count(option) > 1:
-                    ctx.fail(f"{option.opts[0]} is given twice and means one thing; leave one out")
-            keys = [text.partition("=")[0].strip() for text in given.get("set_") or ()]
-            for key in keys:
-                if keys.count(key) > 1:
-                    ctx.fail(f"--set {key} is given twice and means one thing; leave one out")
+            single = (o for o in order if not getattr(o, "multiple", True) and o.nargs == 1)
+            keys = (text.partition("=")[0].strip() for text in given.get("set_") or ())
+            names = [*(option.opts[0] for option in single), *(f"--set {key}" for key in keys)]
+            for name in names:
+                if names.count(name) > 1:
+                    ctx.fail(f"{name} is given twice and means one thing; leave one out")
         return super().parse_args(ctx, args)
-
-
-def _empty() -> typer.Typer:
-    return typer.Typer(
-        context_settings={"help_option_names": ["-h", "--help"]},
-        pretty_exceptions_enable=False,
-        rich_markup_mode=None,
-    )
 
 
 def _as_written(text: str) -> str:
@@ -142,11 +129,10 @@ def _iscat(
     """Position and mass of single particles from interferometric scattering movies."""
 
 
-def _run(app: typer.Typer, program: str, arguments: list[str]) -> int:
+def _run(command: Any, program: str, arguments: list[str]) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-    command = typer.main.get_command(app)
     messages = Messages(program)
     try:
         status = command.main(
@@ -172,4 +158,4 @@ def _run(app: typer.Typer, program: str, arguments: list[str]) -> int:
         if isinstance(end.__context__, BrokenPipeError):
             return 0
         raise
-    return status or 0
+    return int(status or 0)

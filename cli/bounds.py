@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from iscat_cli.console import Messages, grouped, short, table
+from iscat_cli.console import Messages, grouped, listing, short, table
 from iscat_cli.options import Count, ModeSetup, Output, Seed, command
 
 if TYPE_CHECKING:
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from iscat_analysis.config import Config
+    from iscat_analysis.records import Progress
 
 KINDS = {
     "crb_single": "CRB single",
@@ -34,24 +34,9 @@ Goal = Annotated[
 ]
 
 
-@command
-def bounds(
-    messages: Messages,
-    *,
-    scan: str | None = None,
-    optimize: Literal["focus", "attenuation", "pupil"] | None = None,
-    for_: Goal = None,
-    events: Count = None,
-    free: str | None = None,
-    seed: Seed = None,
-    target: str | None = None,
-    preset: Literal["dong2021"] | None = None,
-    setup: ModeSetup,
-    output: Output,
-) -> None:
-    """Print the classical and quantum Cramér–Rao bounds of one particle.
-
-    Per photon: one scattered photon on the camera (CRB) or collected (QCRB).
+@dataclass(frozen=True)
+class Question:
+    """What is asked, beside the bounds themselves.
 
     Options
     -------
@@ -78,6 +63,53 @@ def bounds(
         precision.
     --preset
         Reproduce every table and figure of a paper.
+    """
+
+    scan: str | None = None
+    optimize: Literal["focus", "attenuation", "pupil"] | None = None
+    for_: Goal = None
+    events: Count = None
+    free: str | None = None
+    seed: Seed = None
+    target: str | None = None
+    preset: Literal["dong2021"] | None = None
+
+    def refuse(self, setup: ModeSetup, output: Output) -> None:
+        """Refuse options that do not go together, for the first reason that holds."""
+        from iscat_analysis.errors import ConfigError
+
+        ways = (self.scan, self.optimize, self.target, self.preset)
+        chosen = [way for way in ways if way is not None]
+        pupil, optics, preset = self.optimize == "pupil", self.for_ == OPTICS, self.preset
+        lone_goal = (self.optimize is None) != (self.for_ is None) and not pupil and not optics
+        lone_free = self.events is not None or (self.free is not None and not pupil)
+        reasons: dict[str, object] = {
+            "choose one of --scan, --optimize, --target, --preset": len(chosen) > 1,
+            "--for optics stands alone: leave --scan, --optimize, --target, --preset and --mode "
+            "away": optics and (chosen or setup.mode),
+            "--events and --free need --for optics; --free also goes with --optimize pupil": (
+                lone_free and not optics
+            ),
+            "--seed needs --optimize pupil": self.seed is not None and not pupil,
+            "--optimize and --for go together, as in --optimize focus --for mass": lone_goal,
+            f"--preset {preset} needs --out DIR, the folder to write": preset and not output.out,
+            f"--preset {preset} has its own configuration: leave --config, --set and --mode away": (
+                preset and (setup.config or setup.changes)
+            ),
+        }
+        for why, holds in reasons.items():
+            if holds:
+                raise ConfigError(why)
+
+
+@command
+def bounds(messages: Messages, *, asked: Question, setup: ModeSetup, output: Output) -> None:
+    """Print the classical and quantum Cramér–Rao bounds of one particle.
+
+    Per photon: one scattered photon on the camera (CRB) or collected (QCRB).
+
+    Options
+    -------
     --out DIR
         Folder for figures.
 
@@ -101,127 +133,75 @@ def bounds(
 
         iscat bounds --config setup.toml --for optics --events 60
     """
-    from iscat_analysis.errors import ConfigError
-
-    chosen = [o for o in (scan, optimize, target, preset) if o is not None]
-    if len(chosen) > 1:
-        raise ConfigError("choose one of --scan, --optimize, --target, --preset")
-    if for_ == OPTICS:
-        if chosen or setup.mode is not None:
-            raise ConfigError(
-                "--for optics stands alone: leave --scan, --optimize, --target, --preset and "
-                "--mode away"
-            )
-        _optics(messages, setup.load(), events, free, output)
+    asked.refuse(setup, output)
+    if asked.preset is not None:
+        _paper(messages, output)
         return
-    pupil = optimize == "pupil"
-    if events is not None or (free is not None and not pupil):
-        raise ConfigError(
-            "--events and --free need --for optics; --free also goes with --optimize pupil"
-        )
-    if seed is not None and not pupil:
-        raise ConfigError("--seed needs --optimize pupil")
-    if (optimize is None) != (for_ is None) and not pupil:
-        raise ConfigError("--optimize and --for go together, as in --optimize focus --for mass")
-    if preset is not None:
-        if output.out is None:
-            raise ConfigError(f"--preset {preset} needs --out DIR, the folder to write")
-        if setup.config or setup.changes:
-            raise ConfigError(
-                f"--preset {preset} has its own configuration: leave --config, --set and "
-                "--mode away"
-            )
-        _paper(messages, output.out, overwrite=output.overwrite)
+    config = setup.load()
+    if asked.for_ == OPTICS:
+        _optics(messages, config, asked, output)
         return
-    resolved = setup.load()
-    if output.out is not None:
-        from iscat_analysis.report.bounds import BOUNDS_FILES
-        from iscat_analysis.report.output import check_output
-
-        check_output(output.out, output.overwrite, known=BOUNDS_FILES)
-
     from iscat_analysis.bounds import bounds_report, detection_limit, plan
+    from iscat_analysis.report.bounds import BOUNDS_FILES, write_bounds
 
-    report = bounds_report(resolved)
-    limit = detection_limit(plan(resolved))
+    output.check(BOUNDS_FILES)
+    report = bounds_report(config)
+    limit = detection_limit(plan(config))
     if limit is not None:
         report["detection"] = asdict(limit)
     messages.note(*(f"warning: {line}" for line in report["warnings"]))
-    along: dict[str, Any] = {}
-    if scan is not None:
-        along = _scan(messages, resolved, scan, report)
-    elif pupil:
-        along = _search_pupil(messages, resolved, for_, free, seed or 0, report)
-    elif optimize is not None and for_ is not None:
-        along = _optimize(messages, resolved, optimize, for_, report)
-    elif target is not None:
-        report["target"] = _target(resolved, target)
-    if output.out is not None:
-        from iscat_analysis.report.bounds import write_bounds
+    with messages.progress() as progress:
+        name, found, along = _answer(config, asked, progress)
+    if name:
+        report[name] = found
+    if name == "scan" and found["name"] in ("attenuation", "pixel"):
+        from iscat_analysis.findings.setup import LIGHT_HELD
 
+        messages.report(LIGHT_HELD({"axis": found["name"]}))
+    if name == "pupil" and config.calibration is not None and config.calibration.offset:
+        from iscat_analysis.findings.setup import OFFSET_LEFT_OUT
+
+        messages.report(OFFSET_LEFT_OUT())
+    if output.out is not None:
         write_bounds(report, output.out, overwrite=output.overwrite, **along)
         messages.wrote(output.out)
     messages.show("bounds", report, _lines(report))
 
 
-def _scan(messages: Messages, config: Config, text: str, report: dict[str, Any]) -> dict[str, Any]:
-    """Run a scan, add it to the report, and return what the figure needs."""
-    from iscat_analysis.bounds import parse_scan, scan
-    from iscat_analysis.findings.setup import LIGHT_HELD
+def _answer(
+    config: Config, asked: Question, progress: Progress
+) -> tuple[str, dict[str, Any], dict[str, Any]]:
+    """Give the part of the report that was asked for, by its name, and what its figure needs."""
+    from iscat_analysis import bounds as of
 
-    axis, values = parse_scan(text)
-    with messages.progress() as progress:
-        found = scan(config, axis, values, progress=progress)
-    if axis.name in ("attenuation", "pixel"):
-        messages.report(LIGHT_HELD({"axis": axis.name}))
-    along = {"label": found.label, "here": found.here}
-    report["scan"] = {"name": found.name, **along, "columns": found.table.to_dict("list")}
-    return {"table": found.table, **along}
-
-
-def _optimize(
-    messages: Messages, config: Config, axis: str, parameter: str, report: dict[str, Any]
-) -> dict[str, Any]:
-    """Search, add the optimum to the report, and return what the figure needs."""
-    from iscat_analysis.bounds import optimize
-
-    with messages.progress() as progress:
-        best = optimize(
-            config, "focus" if axis == "focus" else "attenuation", parameter, progress=progress
-        )
-    report["optimum"] = {
-        "of": best.axis,
-        "for": best.parameter,
-        "value": best.value,
-        "bound": best.bound,
-        "configured": best.here,
-        "bound_configured": best.bound_here,
-        "note": best.note,
-    }
-    return {"table": best.scan.table, "label": best.scan.label, "here": best.here}
-
-
-def _search_pupil(
-    messages: Messages,
-    config: Config,
-    parameters: str | None,
-    free: str | None,
-    seed: int,
-    report: dict[str, Any],
-) -> dict[str, Any]:
-    """Search, add the optimum to the report, and return what the folder needs."""
-    from iscat_analysis.bounds import optimize_pupil, parse_names
-    from iscat_analysis.findings.setup import OFFSET_LEFT_OUT
-
-    names = None if free is None else [name.strip() for name in free.split(",")]
-    with messages.progress() as progress:
-        best = optimize_pupil(
-            config, parse_names(parameters, config), free=names, seed=seed, progress=progress
-        )
-    report["pupil"] = best.to_dict()
-    if config.calibration is not None and config.calibration.offset:
-        messages.report(OFFSET_LEFT_OUT())
-    return {"design": best}
+    if asked.scan is not None:
+        axis, values = of.parse_scan(asked.scan)
+        scan = of.scan(config, axis, values, progress=progress)
+        about = {"label": scan.label, "here": scan.here}
+        columns = scan.table.to_dict("list")
+        found = {"name": scan.name, **about, "columns": columns}
+        return "scan", found, {"table": scan.table, **about}
+    if asked.optimize == "pupil":
+        names = None if asked.free is None else [name.strip() for name in asked.free.split(",")]
+        goal, seed = of.parse_names(asked.for_, config), asked.seed or 0
+        pupil = of.optimize_pupil(config, goal, free=names, seed=seed, progress=progress)
+        return "pupil", pupil.to_dict(), {"design": pupil}
+    if asked.optimize is not None and asked.for_ is not None:
+        best = of.optimize(config, asked.optimize, asked.for_, progress=progress)
+        found = {
+            "of": best.axis,
+            "for": best.parameter,
+            "value": best.value,
+            "bound": best.bound,
+            "configured": best.here,
+            "bound_configured": best.bound_here,
+            "note": best.note,
+        }
+        curve = {"table": best.scan.table, "label": best.scan.label, "here": best.here}
+        return "optimum", found, curve
+    if asked.target is not None:
+        return "target", _target(config, asked.target), {}
+    return "", {}, {}
 
 
 def _target(config: Config, text: str) -> dict[str, Any]:
@@ -242,17 +222,13 @@ def _target(config: Config, text: str) -> dict[str, Any]:
     }
 
 
-def _optics(
-    messages: Messages, config: Config, events: int | None, free: str | None, output: Output
-) -> None:
+def _optics(messages: Messages, config: Config, asked: Question, output: Output) -> None:
     """Print how well particles would tell the microscope."""
     from iscat_analysis.bounds.shared import EVENTS, forecast_optics
     from iscat_analysis.report.bounds import OPTICS_BOUNDS_FILES, write_optics_bounds
-    from iscat_analysis.report.output import check_output
 
-    if output.out is not None:
-        check_output(output.out, output.overwrite, known=OPTICS_BOUNDS_FILES)
-    report = forecast_optics(config, events=events or EVENTS, free=free).to_dict()
+    output.check(OPTICS_BOUNDS_FILES)
+    report = forecast_optics(config, events=asked.events or EVENTS, free=asked.free).to_dict()
     messages.note(*(f"warning: {line}" for line in report["warnings"]))
     if output.out is not None:
         write_optics_bounds(report, output.out, overwrite=output.overwrite)
@@ -265,62 +241,47 @@ def _optics_lines(report: Mapping[str, Any]) -> Iterator[RenderableType]:
         f"{report['events']} particles of {report['at']['mass_kda']:g} kDa, signal-to-noise ratio "
         f"{short(report['snr'])} each"
     )
-    yield table(
-        "optics, all fitted together",
-        "value",
-        "±",
-        "without images",
-        rows=(
-            (row["parameter"], f"{row['value']:g}", short(row["sigma"]), f"±{row['usual_error']:g}")
-            for row in report["parameters"]
-        ),
+    yield listing(
+        report["parameters"],
+        "optics, all fitted together | value | ± | without images",
+        "{parameter} | {value:g} | {sigma:.4g} | ±{usual_error:g}",
     )
+    modes = {f"mode {mode}": errors for mode, errors in report["common"].items()}
     names = ("x_nm", "y_nm", "z_nm", "mass_kda")
-    yield table(
-        "error common to all fits",
-        *names,
-        rows=(
-            (f"mode {mode}", *(short(common.get(name)) for name in names))
-            for mode, common in report["common"].items()
-        ),
+    yield _named_rows("error common to all fits", modes, dict(zip(names, names, strict=True)))
+    focus_nm, percent = report["goals"]["focus_nm"], 100 * report["goals"]["mass_rel"]
+    yield listing(
+        report["needed"],
+        f"particles needed for | focus ±{focus_nm:g} nm | masses ±{percent:g} % | SNR of one",
+        "{mass_kda:g} kDa | {focus_nm:,.0f} | {mass_rel:,.0f} | {snr:.4g}",
     )
-    goals = report["goals"]
-    aims = (f"focus ±{goals['focus_nm']:g} nm", f"masses ±{100 * goals['mass_rel']:g} %")
-    rows = []
-    for row in report["needed"]:
-        counts = (row[key] for key in ("focus_nm", "mass_rel"))
-        cells = (grouped(count) if count == count else "–" for count in counts)
-        rows.append((f"{row['mass_kda']:g} kDa", *cells, short(row["snr"])))
-    yield table("particles needed for", *aims, "SNR of one", rows=rows)
     yield from (f"unidentifiable: {line}" for line in report["unidentifiable"])
 
 
-def _paper(messages: Messages, out: Path, *, overwrite: bool) -> None:
+def _paper(messages: Messages, output: Output) -> None:
     """Reproduce a paper."""
     from iscat_analysis.bounds.paper import FIELD_NM, reproduce
     from iscat_analysis.report.bounds import PAPER_FILES, write_paper
-    from iscat_analysis.report.output import check_output
 
-    check_output(out, overwrite, known=PAPER_FILES)
+    output.check(PAPER_FILES)
     with messages.progress() as progress:
         found = reproduce(progress=progress)
-    write_paper(
-        found.curves,
-        found.images,
-        found.table,
-        found.quantum,
-        out,
-        field_nm=FIELD_NM,
-        overwrite=overwrite,
-    )
-    messages.wrote(out, "comparison.html")
+    if output.out is not None:
+        write_paper(
+            found.curves,
+            found.images,
+            found.table,
+            found.quantum,
+            output.out,
+            field_nm=FIELD_NM,
+            overwrite=output.overwrite,
+        )
+        messages.wrote(output.out, "comparison.html")
     names = ("printed", "authors", "dong2021", "exact", "reciprocal")
     records = found.table.to_dict("records")
-    rows = []
-    for row in records:
-        unit = " [nm]" if row["unit"] == "nm" else ""
-        rows.append((f"{row['quantity']}{unit}", *(short(row[name]) for name in names)))
-    quantum = table("quantum bound of one photon", *names, rows=rows)
+    units = {"nm": " [nm]"}
+    rows = {f"{row['quantity']}{units.get(row['unit'], '')}": row for row in records}
+    quantum = _named_rows("quantum bound of one photon", rows, dict(zip(names, names, strict=True)))
     messages.show("comparison", {"table_1": records}, [quantum])
 
 
@@ -335,13 +296,12 @@ def _lines(report: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield _scan_table(report["scan"], report["at"]["free"])
     elif "optimum" in report:
         best = report["optimum"]
-        rows = (("best", "value", "bound"), ("configured", "configured", "bound_configured"))
-        yield table(
-            str(best["of"]),
-            "value",
-            f"CRB {best['for']}",
-            rows=((name, short(best[value]), short(best[bound])) for name, value, bound in rows),
-        )
+        ends = {
+            "best": {"value": best["value"], "bound": best["bound"]},
+            "configured": {"value": best["configured"], "bound": best["bound_configured"]},
+        }
+        columns = {"value": "value", "bound": f"CRB {best['for']}"}
+        yield _named_rows(str(best["of"]), ends, columns)
         yield best["note"]
     elif "pupil" in report:
         yield from _pupil_lines(report["pupil"])
@@ -362,10 +322,10 @@ def _lines(report: Mapping[str, Any]) -> Iterator[RenderableType]:
 
 def _bounds_table(title: str, values: Mapping[str, Mapping[str, Any]]) -> Table:
     """Tabulate bounds: one row per parameter, one column per kind."""
-    kinds = [kind for kind in KINDS if kind in values]
+    kinds = {kind: name for kind, name in KINDS.items() if kind in values}
     names = dict.fromkeys(name for kind in kinds for name in values[kind])
-    rows = ((name, *(short(values[kind].get(name)) for kind in kinds)) for name in names)
-    return table(title, *(KINDS[kind] for kind in kinds), rows=rows)
+    rows = {name: {kind: values[kind].get(name) for kind in kinds} for name in names}
+    return _named_rows(title, rows, kinds)
 
 
 def _information(report: Mapping[str, Any]) -> Table:
@@ -374,29 +334,24 @@ def _information(report: Mapping[str, Any]) -> Table:
     for name, share in report["information_fraction"].items():
         alias = name.replace("_kda", "_rel")
         others = [a if b == alias else b for a, b in rivals if alias in (a, b)]
-        shares = (share, report["information_fraction_joint"].get(name))
         known = ", ".join(other.replace("_rel", "_kda") for other in others) or "–"
-        rows.append((name, *map(_percent, shares), known))
-    return table(
-        "information used",
-        "of the light's",
-        "jointly, of what can be had",
-        "no single measurement is best for it and",
-        rows=rows,
+        jointly = report["information_fraction_joint"].get(name)
+        rows.append({"name": name, "share": share, "jointly": jointly, "others": known})
+    return listing(
+        rows,
+        "information used | of the light's | jointly, of what can be had | no single "
+        "measurement is best for it and",
+        "{name} | {share:.1f%} | {jointly:.1f%} | {others}",
         left=(0, 3),
     )
 
 
-def _percent(share: float | None) -> str:
-    return "–" if share is None or not math.isfinite(share) else f"{100 * share:.1f} %"
-
-
 def _detection_table(limit: Mapping[str, Any]) -> Table:
     title = f"detected but for {100 * limit['miss']:g} %, {100 * limit['false_alarm']:g} % false"
+    columns = {"threshold_{}": "threshold", "snr_{}": "SNR", "mass_{}_kda": "mass_kda"}
     places = {"place known": "known", "field searched": "searched"}
-    keys = ("threshold_{}", "snr_{}", "mass_{}_kda")
-    rows = ((at, *(short(limit[key.format(name)]) for key in keys)) for at, name in places.items())
-    return table(title, "threshold", "SNR", "mass_kda", rows=rows)
+    rows = {at: {key: limit[key.format(name)] for key in columns} for at, name in places.items()}
+    return _named_rows(title, rows, columns)
 
 
 def _scan_table(scanned: Mapping[str, Any], free: list[str]) -> Table:
@@ -428,29 +383,33 @@ def _target_lines(target: Mapping[str, Any]) -> Iterator[RenderableType]:
         rows=rows,
     )
     lines = target["budget"]
-    factors = ["", *(f"{line['factor']:.3f}" for line in lines[1:])]
-    now = [
-        (line["cause"], factor, short(line["bound"]))
-        for line, factor in zip(lines, factors, strict=True)
-    ]
-    product = math.prod(line["factor"] for line in lines)
-    now.append(("all", f"{product:.3f}", short(lines[-1]["bound"])))
-    yield table("now", "factor", f"σ [{unit}]", rows=now)
+    total = {
+        "cause": "all",
+        "factor": math.prod(line["factor"] for line in lines),
+        "bound": lines[-1]["bound"],
+    }
+    yield listing(
+        [{**lines[0], "factor": None}, *lines[1:], total],
+        f"now | factor | σ [{unit}]",
+        "{cause} | {factor:.3f} | {bound:.4g}",
+    )
     if target["note"]:
         yield target["note"]
 
 
 def _pupil_lines(found: Mapping[str, Any]) -> Iterator[RenderableType]:
     """Print the settings of a pupil, what they give, and how near that comes to the bound."""
-    ends = ("configured", "best")
+    ends = {"configured": "configured", "best": "best"}
     settings = {name: row for name, row in found["settings"].items() if any(row.values())}
-    yield _named_rows("pupil", settings, dict(zip(ends, ends, strict=True)))
-    kinds = {"configured": "configured", "best": "best", "holevo": "Holevo", "qcrb": "QCRB"}
+    yield _named_rows("pupil", settings, ends)
+    kinds = ends | {"holevo": "Holevo", "qcrb": "QCRB"}
     yield _named_rows("σ, all estimated together", found["sigma"], kinds)
-    share = {key: 100 * value for key, value in found["share"].items() if value is not None}
-    labels = {end: end for end in ends} | {"quiet": "best, background known and no read noise"}
-    rows = ((label, f"{share[k]:.1f}" if k in share else "–") for k, label in labels.items())
-    yield table("of what one measurement can take", "%", rows=rows)
+    labels = ends | {"quiet": "best, background known and no read noise"}
+    yield listing(
+        [{"label": label, "share": found["share"].get(key)} for key, label in labels.items()],
+        "of what one measurement can take | share",
+        "{label} | {share:.1f%}",
+    )
     yield (
         f"{short(found['photons_per_pixel'])} e per pixel and frame in the background, "
         f"{short(found['peak_e'])} e in the brightest pixel; "
@@ -462,5 +421,5 @@ def _named_rows(
     title: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]
 ) -> Table:
     """Tabulate numbers: a row for each name, a column for each key."""
-    cells = ((name, *(short(row[key]) for key in columns)) for name, row in rows.items())
-    return table(title, *columns.values(), rows=cells)
+    written = ((name, *(short(row.get(key)) for key in columns)) for name, row in rows.items())
+    return table(title, *columns.values(), rows=written)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from iscat_cli.console import Messages, table
+from iscat_cli.console import Messages, listing, table
 from iscat_cli.options import Output, Setup, command, numbers
 
 if TYPE_CHECKING:
@@ -59,19 +59,11 @@ def camera(
     if dark is not None and offset is not None:
         raise ConfigError("--dark measures the offset: leave --offset out")
     folder = output.beside(given[0], ".camera")
-    with messages.progress() as progress:
-        found = camera_calibration(
-            stacks or (),
-            folder,
-            dark=dark,
-            offset_adu=offset,
-            maps=maps,
-            overwrite=output.overwrite,
-            progress=progress,
-            notify=messages.note,
-        )
-    messages.show("camera", {**found.to_dict(), "out": str(folder)}, _camera_lines(found))
-    messages.wrote(folder, "camera.html")
+    known: Any = {"dark": dark, "offset_adu": offset, "maps": maps, "overwrite": output.overwrite}
+    with messages.telling() as told:
+        found = camera_calibration(stacks or (), folder, **known, **told)
+    values, page = found.to_dict(), "camera.html"
+    messages.answer("camera", values, _camera_lines(found), folder=folder, page=page)
 
 
 def _camera_lines(found: CameraCalibration) -> Iterator[RenderableType]:
@@ -147,8 +139,8 @@ def mass(
         overwrite=output.overwrite,
         notify=messages.note,
     )
-    messages.show("calibration", {**found.to_dict(), "out": str(folder)}, _mass_lines(found))
-    messages.wrote(folder, "calibration.html")
+    values, page = found.to_dict(), "calibration.html"
+    messages.answer("calibration", values, _mass_lines(found), folder=folder, page=page)
 
 
 def _standards(text: str) -> tuple[list[float], list[float]]:
@@ -170,13 +162,12 @@ def _standards(text: str) -> tuple[list[float], list[float]]:
 
 
 def _mass_lines(found: MassCalibration) -> Iterator[RenderableType]:
-    headings = ("contrast", "± ", "by the line [kDa]", "95 % low", "95 % high", "residual [%]")
-    names = ("contrast", "contrast_se", "found_kda", "low_kda", "high_kda", "residual_percent")
-    rows = (
-        (f"{row['mass_kda']:g}", *(f"{row[name]:.4g}" for name in names))
-        for row in found.standards.to_dict("records")
+    yield listing(
+        found.standards.to_dict("records"),
+        "standard [kDa] | contrast | ± | by the line [kDa] | 95 % low | 95 % high | residual [%]",
+        "{mass_kda:g} | {contrast:.4g} | {contrast_se:.4g} | {found_kda:.4g} | {low_kda:.4g} "
+        "| {high_kda:.4g} | {residual_percent:.4g}",
     )
-    yield table("standard [kDa]", *headings, rows=rows)
     yield found.to_toml()
 
 
@@ -218,29 +209,19 @@ def optics(
     from iscat_analysis.answers.calibrations import optics_calibration
     from iscat_analysis.errors import ConfigError, DataError
 
+    if measured and (free is not None or focus_step is not None):
+        raise ConfigError(
+            "--measured takes the picture as it is at one focus: leave out --free and --focus-step"
+        )
     if measured:
-        if free is not None or focus_step is not None:
-            raise ConfigError(
-                "--measured takes the picture as it is at one focus: leave out --free and "
-                "--focus-step"
-            )
         _measure(messages, movie, setup, output)
         return
     folder = output.beside(movie, ".optics")
-    with messages.progress() as progress:
-        found = optics_calibration(
-            movie,
-            setup.load(),
-            folder,
-            free=free,
-            focus_step_nm=focus_step,
-            overwrite=output.overwrite,
-            progress=progress,
-            notify=messages.note,
-        )
+    known: Any = {"free": free, "focus_step_nm": focus_step, "overwrite": output.overwrite}
+    with messages.telling() as told:
+        found = optics_calibration(movie, setup.load(), folder, **known, **told)
     values = {key: value for key, value in found.to_dict().items() if key != "pictures"}
-    messages.show("optics", {**values, "out": str(folder)}, _optics_lines(found))
-    messages.wrote(folder, "optics.html")
+    messages.answer("optics", values, _optics_lines(found), folder=folder, page="optics.html")
     if not found.accepted:
         raise DataError(
             f"{movie}: the optics are refused: {'; '.join(found.measured.refusals)}; record "
@@ -249,12 +230,12 @@ def optics(
 
 
 def _optics_lines(found: OpticsCalibration) -> Iterator[RenderableType]:
-    rows = []
-    for row in found.parameters.to_dict("records"):
-        values = (row[name] for name in ("value", "sigma", "crb", "configured"))
-        cells = ("–" if value != value else f"{value:.6g}" for value in values)
-        rows.append((row["parameter"], *cells, row["state"]))
-    yield table("optics", "value", "±", "CRB", "configured", "", rows=rows, left=(0, 5))
+    yield listing(
+        found.parameters.to_dict("records"),
+        "optics | value | ± | CRB | configured | ",
+        "{parameter} | {value:.6g} | {sigma:.6g} | {crb:.6g} | {configured:.6g} | {state}",
+        left=(0, 5),
+    )
     yield found.headline()
 
 
@@ -264,17 +245,12 @@ def _measure(messages: Messages, movie: Path, setup: Setup, output: Output) -> N
     from iscat_analysis.errors import DataError
 
     folder = output.beside(movie, ".optics")
-    with messages.progress() as progress:
+    with messages.telling() as told:
         found = template_calibration(
-            movie,
-            setup.load(),
-            folder,
-            overwrite=output.overwrite,
-            progress=progress,
-            notify=messages.note,
+            movie, setup.load(), folder, overwrite=output.overwrite, **told
         )
-    messages.show("template", {**found.to_dict(), "out": str(folder)}, [found.headline()])
-    messages.wrote(folder, "template.html")
+    values, lines, page = found.to_dict(), [found.headline()], "template.html"
+    messages.answer("template", values, lines, folder=folder, page=page)
     if not found.accepted:
         raise DataError(
             f"{movie}: the template is refused: {'; '.join(found.refusals)}; record more particles "

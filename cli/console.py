@@ -12,7 +12,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Container, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -20,6 +20,7 @@ import typer
 from rich.console import Console, RenderableType
 from rich.text import Text
 
+from iscat_analysis.options import BindingOptions, SpeciesOptions, Told, options_of
 from iscat_cli import INTERRUPTED
 from iscat_cli.ending import interrupts
 
@@ -104,6 +105,22 @@ class Messages:
             for line in lines:
                 print_result(line)
 
+    def answer(
+        self,
+        document: str,
+        values: Mapping[str, Any],
+        lines: Iterable[RenderableType],
+        *,
+        folder: Path | None,
+        page: str,
+        notes: Iterable[str] = (),
+    ) -> None:
+        """Print a result, what there is to say of it, and the folder where it was written."""
+        self.show(document, values if folder is None else {**values, "out": str(folder)}, lines)
+        self.note(*notes)
+        if folder is not None:
+            self.wrote(folder, page)
+
     def _line(self, text: str) -> None:
         if self._terminal.is_terminal:
             self._terminal.print(text, soft_wrap=True)
@@ -111,34 +128,34 @@ class Messages:
             _write(sys.stderr, f"{text}\n")
 
     @contextmanager
+    def telling(self) -> Iterator[Told]:
+        """Give the arguments by which work tells how far it is, and what there is to say."""
+        with self.progress() as progress:
+            yield {"progress": progress, "notify": self.note}
+
+    @contextmanager
     def progress(self) -> Iterator[Progress]:
         """Show how far the work is: bars on a terminal, a line now and then elsewhere."""
-        with self._shown() as shown:
+        with ExitStack() as stack:
+            shown: Progress = _Lines(self)
+            if self._terminal.is_terminal and not self.quiet:
+                from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+                from rich.progress import Progress as Bars
 
-            def warn(stage: str, done: int, total: int) -> None:
+                columns = (
+                    TextColumn("{task.description}"),
+                    BarColumn(),
+                    TextColumn("{task.fields[steps]}"),
+                    TimeRemainingColumn(elapsed_when_finished=True),
+                )
+                bars = Bars(*columns, console=self._terminal, transient=True)
+                shown = _Drawing(stack.enter_context(bars))
+
+            def watched(stage: str, done: int, total: int) -> None:
                 self.writing = stage == "report" and done < total
                 shown(stage, done, total)
 
-            yield warn
-
-    @contextmanager
-    def _shown(self) -> Iterator[Progress]:
-        if self.quiet:
-            yield _ignore
-        elif self._terminal.is_terminal:
-            from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-            from rich.progress import Progress as Bars
-
-            columns = (
-                TextColumn("{task.description}"),
-                BarColumn(),
-                TextColumn("{task.fields[steps]}"),
-                TimeRemainingColumn(elapsed_when_finished=True),
-            )
-            with Bars(*columns, console=self._terminal, transient=True) as bars:
-                yield _Drawing(bars)
-        else:
-            yield _Lines(self)
+            yield watched
 
 
 class _Drawing:
@@ -204,26 +221,20 @@ def duration(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60} min"
 
 
-def _ignore(stage: str, done: int, total: int) -> None:
-    """Show no progress."""
-
-
 @contextmanager
 def failures(messages: Messages) -> Iterator[None]:
     """Turn whatever a command raises into one line and an exit status."""
-    debug = messages.debug
 
     def show(
         message: Warning | str,
         category: type[Warning],
         filename: str,
         lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
+        *_: Any,
+        **__: Any,
     ) -> None:
-        del file, line  # always stderr, never the source
-        where = f" ({category.__name__}, {Path(filename).name}:{lineno})" if debug else ""
-        messages.note(f"warning: {message}{where}")
+        where = f" ({category.__name__}, {Path(filename).name}:{lineno})"
+        messages.note(f"warning: {message}{where if messages.debug else ''}")
 
     with warnings.catch_warnings(), interrupts(messages) as watched:
         warnings.showwarning = show
@@ -239,59 +250,35 @@ def failures(messages: Messages) -> Iterator[None]:
             if watched is not None and watched.answer_lost():  # the compiler made this of it
                 messages.error("interrupted")
                 raise typer.Exit(INTERRUPTED) from None
-            if debug:
+            if messages.debug:
                 _write(sys.stderr, traceback.format_exc())
-            line, status = _verdict(error, debug=debug)
+            line, status = _verdict(error, debug=messages.debug)
             messages.error(with_options(line))
             raise typer.Exit(status) from error
 
 
+_SAME = (
+    "config dark draws free inject kd landing maps model offset optimize out overwrite scan "
+    "scheduler standards target truth"
+)
 _OPTIONS = {
+    **{name: name for name in _SAME.split()},
     **{
-        name: name
-        for name in (
-            "calibration",
-            "config",
-            "dark",
-            "draws",
-            "free",
-            "hold",
-            "inactive",
-            "inject",
-            "k",
-            "kd",
-            "ladder",
-            "landing",
-            "maps",
-            "model",
-            "offset",
-            "optimize",
-            "out",
-            "overwrite",
-            "scan",
-            "scheduler",
-            "standards",
-            "steps",
-            "target",
-            "truth",
-        )
+        name: option.flag.removeprefix("--").partition("/")[0]
+        for group in (BindingOptions, SpeciesOptions)
+        for name, option in options_of(group).items()
+        if option.flag
     },
-    "above_kda": "above",
     "settings": "set",
-    "start_kda": "start",
     "focus_step_nm": "focus-step",
     "frame_rate_hz": "frame-rate",
     "interval_s": "interval",
-    "landing_power": "landing",
-    "limit_kda": "limit",
     "limit_sigma_kda": "limit",
     "kd_masses_kda": "kd-masses",
-    "masses_kda": "masses",
     "offset_adu": "offset",
     "peaks_at": "peaks",
     "pixel_size_nm": "pixel-size-nm",
     "scheduler_file": "scheduler-file",
-    "sigma_kda": "sigma",
     "standards_kda": "standards",
 }
 """Argument of the library → option of a command."""
@@ -321,20 +308,14 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """What the system says where a file cannot grow; a write does not tell which file it was."""
 
 
-def _interrupted(error: Exception) -> bool:
-    """Whether an interrupt hides behind an error, as it does where it meets compiled code."""
-    return isinstance(error, SystemError) and isinstance(
-        error.__cause__ or error.__context__, KeyboardInterrupt
-    )
-
-
 def _verdict(error: Exception, *, debug: bool) -> tuple[str, int]:
     from iscat_analysis.errors import IscatError
 
     if isinstance(error, IscatError):
         return str(error), error.exit_status
-    if _interrupted(error):
-        return "interrupted", INTERRUPTED
+    cause = error.__cause__ or error.__context__
+    if isinstance(error, SystemError) and isinstance(cause, KeyboardInterrupt):
+        return "interrupted", INTERRUPTED  # that met compiled code
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: cannot be read or written ({error.strerror})", UNEXPECTED
     if isinstance(error, OSError) and error.errno in _NO_ROOM:
@@ -368,6 +349,15 @@ def table(*headings: str, rows: Iterable[Iterable[str]] = (), left: Container[in
     for row in rows:
         made.add_row(*row)
     return made
+
+
+def listing(
+    records: Iterable[Mapping[str, Any]], heading: str, row: str, *, left: Container[int] = (0,)
+) -> Table:
+    """Make a table of records: a heading for each column between bars, and as `cells` a format."""
+    from iscat_analysis.units import cells
+
+    return table(*heading.split(" | "), rows=cells(records, row), left=left)
 
 
 def grouped(number: float) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import typer
 
 from iscat_cli import INTERRUPTED
-from iscat_cli.console import Messages, short, table
+from iscat_cli.console import Messages, listing, short
 from iscat_cli.kd import upper_end
 from iscat_cli.options import MovieSetup, Printed, command, numbers, parsed, two_numbers
 
@@ -47,16 +47,10 @@ class DaySetup(MovieSetup, Printed):
     @property
     def arguments(self) -> dict[str, Any]:
         """Arguments of the library's functions."""
-        return {
-            "config": self.config,
-            "settings": self.changes,
-            "calibration": self.calibration,
-            "standards": self.standards,
-            "kd": self.kd,
-            "kd_masses_kda": numbers("--kd-masses", self.kd_masses),
-            "scheduler": self.scheduler,
-            "scheduler_file": self.scheduler_file,
-        }
+        names = ("config", "calibration", "standards", "kd", "scheduler", "scheduler_file")
+        masses = numbers("--kd-masses", self.kd_masses)
+        given = {name: getattr(self, name) for name in names}
+        return given | {"settings": self.changes, "kd_masses_kda": masses}
 
 
 @command
@@ -111,17 +105,9 @@ def batch(
 
     from iscat_analysis.day import batch as run
 
-    with messages.progress() as progress:
-        found = run(
-            samples,
-            out=out,
-            **setup.arguments,
-            only=part,
-            merge=merge,
-            progress=progress,
-            notify=messages.note,
-            command=messages.command,
-        )
+    how: Any = {"only": part, "merge": merge, "command": messages.command}
+    with messages.telling() as told:
+        found = run(samples, out=out, **setup.arguments, **how, **told)
     messages.show("batch", found.to_dict(), _lines(found, part))
     for name, why in found.failed:
         messages.error(f"{name}: {why}")
@@ -146,15 +132,17 @@ def _lines(found: Batch, part: tuple[int, int] | None = None) -> Iterator[Render
     if part is not None:
         yield f"part {part[0]} of {part[1]}: {done}; results in {found.out}"
         return
-    rows = []
-    for row in found.movies.head(ROWS_SHOWN).to_dict("records"):
-        cautions = row["why"] if row["state"] == "failed" else row["cautions"]
-        cautions = "not analysed yet" if row["state"] == "missing" else cautions
-        texts = (text if isinstance(text, str) else "" for text in (row["answer"], cautions))
-        numbers = (short(row[name]) for name in ("events", "landings"))
-        rows.append((str(row["movie"]), str(row["sample"]), *numbers, *texts))
-    headings = ("movie", "sample", "events", "landings", "answer", "cautions")
-    shown = table(*headings, rows=rows, left=(0, 1, 4, 5))
+    rows = found.movies.head(ROWS_SHOWN).to_dict("records")
+    for row in rows:
+        states = {"failed": row["why"], "missing": "not analysed yet"}
+        texts = {"answer": row["answer"], "cautions": states.get(row["state"], row["cautions"])}
+        row |= {name: text if isinstance(text, str) else "" for name, text in texts.items()}
+    shown = listing(
+        rows,
+        "movie | sample | events | landings | answer | cautions",
+        "{movie} | {sample} | {events:.4g} | {landings:.4g} | {answer} | {cautions}",
+        left=(0, 1, 4, 5),
+    )
     for column in shown.columns[4:]:
         column.no_wrap = False
     yield shown
@@ -223,20 +211,11 @@ def watch(
     from iscat_analysis.day.watch import FOLDER
     from iscat_analysis.day.watch import watch as run
 
-    with messages.progress() as progress:
-        found = run(
-            folder,
-            out=out,
-            **setup.arguments,
-            interval_s=interval,
-            progress=progress,
-            notify=messages.note,
-            command=messages.command,
-        )
+    how: Any = {"interval_s": interval, "command": messages.command}
+    with messages.telling() as told:
+        found = run(folder, out=out, **setup.arguments, **how, **told)
     if found is None:
-        nothing: dict[str, Any] = dict.fromkeys(
-            ("movies", "species", "kd", "analysed", "failed"), ()
-        )
+        nothing = dict.fromkeys(("movies", "species", "kd", "analysed", "failed"), ())
         values = {"out": str(out or folder / FOLDER), **nothing}
         messages.show("batch", values, [f"no movie came into {folder}"])
         return
@@ -271,17 +250,9 @@ def _watch_one(
                 "give the folder"
             )
     folder = path_beside(movie, ".iscat") if out is None else out
-    config = setup.of(movie, messages)
-    with messages.progress() as progress:
-        found = watch_movie(
-            movie,
-            config,
-            out=folder,
-            interval_s=interval,
-            progress=progress,
-            notify=messages.note,
-            command=messages.command,
-        )
+    config, how = setup.of(movie, messages), {"command": messages.command}
+    with messages.telling() as told:
+        found = watch_movie(movie, config, out=folder, interval_s=interval, **how, **told)
     rows = found.table.to_dict("records")
     values = {**found.summary, "events": rows, "out": str(folder)}
     messages.show("fit", values, [f"{len(rows)} events; results in {folder}"])

@@ -52,9 +52,8 @@ class Interrupts:
         signal.pthread_kill(self._thread.ident or 0, signal.SIGUSR1)
         self._thread.join()
 
-    def handle(self, number: int, frame: FrameType | None) -> None:
+    def handle(self, _number: int, _frame: FrameType | None) -> None:
         """Raise the interrupt, in the main thread."""
-        del number, frame
         if self._received == signal.SIGINT:
             raise KeyboardInterrupt
         raise KeyboardInterrupt(f"{self._received.name} was received")

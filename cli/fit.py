@@ -140,37 +140,28 @@ def fit(
     folder = output.beside(stack, ".iscat")
     with (
         open_executor(setup.scheduler, setup.scheduler_file) as executor,
-        messages.progress() as progress,
+        messages.telling() as told,
     ):
         from iscat_analysis.pipeline import fit_stack
 
-        analysis = fit_stack(
-            stack,
-            resolved,
-            out=folder,
-            overwrite=output.overwrite,
-            progress=progress,
-            notify=messages.note,
-            command=messages.command,
-            inject=inject or 0,
-            executor=executor,
-        )
+        how: Any = {"command": messages.command, "inject": inject or 0, "executor": executor}
+        how["overwrite"] = output.overwrite
+        analysis = fit_stack(stack, resolved, out=folder, **how, **told)
     rows: list[dict[str, Any]] = analysis.table.to_dict("records")
     found: dict[str, Any] = {**analysis.summary, "events": rows, "out": str(folder)}
-    lines, tracks = _event_lines, analysis.tracks
-    if tracks is not None:
-        lines, found["tracks"] = _track_lines, tracks.to_dict("records")
-    messages.show("fit", found, lines(analysis, folder))
-    flagged = list(filter(_is_flagged, rows))
-    messages.note(*_advice(flagged))
-    if tracks is not None:
+    if analysis.tracks is None:
+        messages.show("fit", found, _event_lines(analysis, folder))
+        messages.note(*_advice(rows))
+    else:
         from iscat_analysis.report.answer import advice
 
-        messages.note(*advice(tracks))
-        flagged += filter(_is_flagged, found["tracks"])
-    understated = analysis.summary.get("repeats", {}).get("understated", False)
+        found["tracks"] = analysis.tracks.to_dict("records")
+        messages.show("fit", found, _track_lines(analysis, folder))
+        messages.note(*_advice(rows), *advice(analysis.tracks))
     if strict is not None and (
-        flagged or understated or codes & {finding.code for finding in analysis.findings}
+        any(map(_is_flagged, (*rows, *found.get("tracks", ()))))
+        or analysis.summary.get("repeats", {}).get("understated", False)
+        or codes & {finding.code for finding in analysis.findings}
     ):
         raise typer.Exit(3)  # something is flagged
 
@@ -191,12 +182,12 @@ def _is_flagged(row: Mapping[str, Any]) -> bool:
     return row["status"] != "ok" or (isinstance(flags, str) and bool(flags))
 
 
-def _advice(flagged: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+def _advice(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Say how many events have each status or flag, and what the user can do."""
     from iscat_analysis.records import NO_EVENT, Status
 
     flag_counts: Counter[str] = Counter()
-    for row in flagged:
+    for row in filter(_is_flagged, rows):
         found = {str(row["status"]), *str(row["flags"] or "").split(";")}
         flag_counts.update(found & NO_EVENT or found)
     for status in Status:
@@ -210,35 +201,26 @@ def _event_lines(analysis: Analysis, folder: Path) -> Iterator[RenderableType]:
 
     from iscat_analysis.config import MODES
     from iscat_analysis.records import counted, tally
-    from iscat_analysis.report.answer import (
-        answers,
-        as_contrasts,
-        as_diameters,
-        caution,
-        main_quantity,
-        not_a_mass,
-    )
-    from iscat_analysis.report.answer import is_uncalibrated as uncalibrated
+    from iscat_analysis.report import answer as said
 
     found = tally(analysis.table)
     if found.number:
-        console = Console()
-        if (flagged := caution(analysis.table)) is not None:
+        if (flagged := said.caution(analysis.table)) is not None:
             yield f"{flagged.text}."
         shown, mass = counted(analysis.table).head(ROWS_SHOWN), ("mass", "kDa")
-        if uncalibrated(analysis):
-            yield from not_a_mass(analysis)
+        if said.is_uncalibrated(analysis):
+            yield from said.not_a_mass(analysis)
             mass = ("mass, model scale", "kDa")
-            if main_quantity(analysis).column == "contrast":
-                shown, mass = as_contrasts(shown), ("contrast", "")
-        mode = MODES[analysis.mode]
+            if said.main_quantity(analysis).column == "contrast":
+                shown, mass = said.as_contrasts(shown), ("contrast", "")
+        mode, console = MODES[analysis.mode], Console()
         if mode.fits_sizes:
-            shown, mass = as_diameters(shown), ("diameter", "nm")
+            shown, mass = said.as_diameters(shown), ("diameter", "nm")
         width = console.width if console.is_terminal else None
         yield events_table(shown.to_dict("records"), mode.free, mass=mass, width=width)
         if found.number > ROWS_SHOWN:
             yield f"… and {found.number - ROWS_SHOWN} more in {folder / 'fits.csv'}"
-        yield from (answer.text for answer in answers(analysis, analysis.table))
+        yield from (answer.text for answer in said.answers(analysis, analysis.table))
     yield f"{found.text()}; results in {folder}"
 
 
@@ -264,15 +246,14 @@ def tracks_table(tracks: pd.DataFrame, *, contrast: bool = False) -> Table:
     from iscat_analysis.report.answer import TRACK_HEADINGS
 
     rows = tracks.to_dict("records")
-    columns: dict[str, list[str]] = {
-        "track": [str(row["track"]) for row in rows],
-        "frames": [f"{row['first_frame']}–{row['last_frame']}" for row in rows],
-    }
+    columns = {"track": [str(row["track"]) for row in rows]}
+    columns["frames"] = [f"{row['first_frame']}–{row['last_frame']}" for row in rows]
     for name, (column, error, unit) in TRACK_HEADINGS.items():
         if name == "mass" and contrast:
+            relative = [row[error] / row[column] for row in rows]
             columns["contrast ± σ"] = [
-                _with_spread(row["contrast"], abs(row[error] * row["contrast"] / row[column]))
-                for row in rows
+                _with_spread(row["contrast"], abs(share * row["contrast"]))
+                for row, share in zip(rows, relative, strict=True)
             ]
         elif name in ("mass", "D") or (column in tracks and tracks[column].notna().any()):
             heading = f"{name} ± σ{f' [{unit}]' if unit else ''}"

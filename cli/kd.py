@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Unpack
 
 from iscat_analysis.options import BindingOptions
-from iscat_cli.console import Messages, short, table
+from iscat_cli.console import Messages, listing, short
 from iscat_cli.options import Output, command
 
 if TYPE_CHECKING:
@@ -48,34 +49,25 @@ def kd(
 
     found = fit_kd(samples, model=model, **options, out=output.out, overwrite=output.overwrite)
     values = {"source": str(samples), **found.to_dict()}
-    if output.out is not None:
-        values["out"] = str(output.out)
-    messages.show("kd", values, _lines(found))
-    messages.note(*found.notes)
-    if output.out is not None:
-        messages.wrote(output.out, "figures/kd.png")
+    folder, page = output.out, "figures/kd.png"
+    messages.answer("kd", values, _lines(found), folder=folder, page=page, notes=found.notes)
 
 
 def _lines(found: Binding) -> Iterator[RenderableType]:
     columns = [c for c in ("concentration_nm", "a_nm", "b_nm") if c in found.samples]
-    headings = [name.replace("_nm", " [nM]") for name in columns]
+    headings = " | ".join(name.replace("_nm", " [nM]") for name in columns)
+    totals = " | ".join(f"{{{name}:.4g}}" for name in columns)
     what = "dimers" if found.model == "dimer" else "AB"
-    shown = table("table", *headings, "events", what, "95 %", "by K_D", "pull", "background")
-    for row in found.samples.to_dict("records"):
-        shown.add_row(
-            str(row["path"]),
-            *(short(row[name]) for name in columns),
-            str(row["events"]),
-            f"{100 * row['complexes']:.3g} %",
-            f"{100 * row['complexes_low']:.3g} to {100 * row['complexes_high']:.3g} %",
-            f"{100 * row['predicted']:.3g} %",
-            f"{row['pull']:+.1f}",
-            f"{100 * row['background']:.2g} %",
-        )
-    yield shown
+    yield listing(
+        found.samples.to_dict("records"),
+        f"table | {headings} | events | {what} | 95 % | by K_D | pull | background",
+        f"{{path}} | {totals} | {{events}} | {{complexes:.3g%}} | "
+        "{complexes_low:.3g%} to {complexes_high:.3g%} | {predicted:.3g%} | {pull:+.1f} | "
+        "{background:.2g%}",
+    )
     fit = found.fit
     inert = ""
-    if fit.inactive_se == fit.inactive_se:
+    if math.isfinite(fit.inactive_se):
         inert = f", inactive {100 * fit.inactive:.2g} ± {100 * fit.inactive_se:.1g} %"
     masses = ", ".join(short(mass) for mass in fit.masses_kda)
     yield (

@@ -44,15 +44,15 @@ Seed = Annotated[int | None, typer.Option(min=0)]
 
 def complete_setting(incomplete: str) -> list[str]:
     """Offer to the shell every key of the configuration that begins so."""
-    from iscat_analysis.config import SIMULATED, Config
+    from iscat_analysis.config import SIMULATED, Config, known_keys
 
-    found = []
-    for section, field in Config.model_fields.items():
-        # [calibration] may be absent: its annotation is a union with None
-        models = [part for part in (field.annotation, *get_args(field.annotation)) if part]
-        keys = next(m.model_fields for m in models if hasattr(m, "model_fields"))
-        found += [f"{section}.{key}=" for key in keys if key not in SIMULATED]
-    return [name for name in found if name.startswith(incomplete)]
+    names = (
+        f"{section}.{key}="
+        for section in Config.model_fields
+        for key in known_keys([section])
+        if key not in SIMULATED
+    )
+    return [name for name in names if name.startswith(incomplete)]
 
 
 @dataclass(frozen=True)
@@ -188,6 +188,13 @@ class Output(Written):
 
         return path_beside(source, ending) if self.out is None else self.out
 
+    def check(self, known: frozenset[str]) -> None:
+        """Refuse a folder that may not be written, before the work begins."""
+        if self.out is not None:
+            from iscat_analysis.report.output import check_output
+
+            check_output(self.out, self.overwrite, known=known)
+
 
 @dataclass(frozen=True)
 class Command:
@@ -218,30 +225,29 @@ class _Always:
 def command(work: Callable[..., None]) -> Command:
     """Make a command of a function, which may ask for `messages`, with the options of all."""
     about, helps, example = _read(work.__doc__)
-    parameters = dict(inspect.signature(work, eval_str=True).parameters)
-    keywords: dict[str, tuple[Any, Option]] = {}
-    for each in [*parameters.values()]:
-        if each.kind is inspect.Parameter.VAR_KEYWORD:  # a group of the library's
-            keywords = options_of(get_args(parameters.pop(each.name).annotation)[0])
-    heard = parameters.pop("messages", None) is not None
-    own = parameters.values()
-    groups: dict[str, Any] = {
-        each.name: each.annotation for each in own if is_dataclass(each.annotation)
-    }
     arguments = iter([name for name in helps if not name.startswith("--")])
+    declared = inspect.signature(work, eval_str=True).parameters
+    groups: dict[str, Any] = {
+        name: each.annotation for name, each in declared.items() if is_dataclass(each.annotation)
+    }
     for group in (*groups.values(), _Always):
         for part in group.__mro__:
             helps = _read(part.__doc__)[1] | helps
+    keywords: dict[str, Option] = {}
+    offered = [_by_name("context", typer.Context)]
+    for name, each in declared.items():
+        if each.kind is inspect.Parameter.VAR_KEYWORD:  # a group of the library's
+            keywords = options_of(get_args(each.annotation)[0])
+        elif name in groups:
+            offered += _members(each.annotation)
+        elif name != "messages":
+            offered.append(each)
+    offered += [*_keywords(keywords), *_members(_Always)]
 
     @wraps(work)
     def run(context: typer.Context, *, quiet: bool, debug: bool, **given: Any) -> None:
-        told = Messages(
-            context.command_path,
-            quiet=quiet,
-            debug=debug,
-            command=context.obj,
-            json=given.get("json", False),
-        )
+        json, words = given.get("json", False), context.obj
+        told = Messages(context.command_path, quiet=quiet, debug=debug, command=words, json=json)
         if len(configs := given.get("config") or ()) > 1:
             first, *later = map(str, configs)
             from iscat_analysis.findings.setup import CONFIGURATION_MERGED
@@ -249,40 +255,42 @@ def command(work: Callable[..., None]) -> Command:
             told.report(CONFIGURATION_MERGED({"first": first, "others": ", then ".join(later)}))
         for name, group in groups.items():
             given[name] = group(**{field.name: given.pop(field.name) for field in fields(group)})
+        if "messages" in declared:
+            given["messages"] = told
         with failures(told):
-            for name, (_, option) in keywords.items():
-                if option.text:
-                    given[name] = _READERS[option.text](option.flag, given[name]) or option.default
+            for name in keywords.keys() & _READERS.keys():
+                option = keywords[name]
+                given[name] = _READERS[name](option.flag, given[name]) or option.default
             if "limit_kda" in given:
                 given["limit_kda"], given["limit_sigma_kda"] = given["limit_kda"] or (None, None)
-            work(**given, **({"messages": told} if heard else {}))
+            work(**given)
 
-    by_name = inspect.Parameter.KEYWORD_ONLY
-    offered = [inspect.Parameter("context", by_name, annotation=typer.Context)]
-    for each in parameters.values():
-        offered += _members(each.annotation) if each.name in groups else [each]
-    offered += [*_keywords(keywords), *_members(_Always)]
     described = [_described(each, helps, arguments) for each in offered]
-    named = [each.replace(kind=by_name) for each in described]
+    named = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in described]
     vars(run)["__signature__"] = inspect.Signature(named)
     run.__annotations__ = {each.name: each.annotation for each in described}
     run.__doc__ = about
     return Command(work.__name__, about.partition("\n")[0], example, run)
 
 
-def _keywords(known: dict[str, tuple[Any, Option]]) -> Iterator[inspect.Parameter]:
+def _by_name(
+    name: str, annotation: Any, default: Any = inspect.Parameter.empty
+) -> inspect.Parameter:
+    kind = inspect.Parameter.KEYWORD_ONLY
+    return inspect.Parameter(name, kind, default=default, annotation=annotation)
+
+
+def _keywords(known: dict[str, Option]) -> Iterator[inspect.Parameter]:
     """Give keywords of the library as options of a command."""
-    for name, (kind, option) in known.items():
-        if not option.flag:
-            continue
-        about = typer.Option(option.flag, metavar=option.metavar, help=with_options(option.help))
-        written = Path | None if isinstance(kind, ForwardRef) else kind
-        yield inspect.Parameter(
-            name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=None if option.text else option.default,
-            annotation=Annotated[str | None if option.text else written, about],
-        )
+    for name, option in known.items():
+        flag, _, metavar = option.written.partition(" ")
+        if flag:
+            about = typer.Option(flag, metavar=metavar or None, help=with_options(option.help))
+            kind = Path | None if isinstance(option.kind, ForwardRef) else option.kind
+            default = option.default
+            if name in _READERS:
+                kind, default = str | None, None
+            yield _by_name(name, Annotated[kind, about], default)
 
 
 def _members(group: type) -> Iterator[inspect.Parameter]:
@@ -290,12 +298,7 @@ def _members(group: type) -> Iterator[inspect.Parameter]:
     types = get_type_hints(group, include_extras=True)
     for part in group.__mro__[:-1]:
         for name in inspect.get_annotations(part):
-            yield inspect.Parameter(
-                name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=getattr(group, name),
-                annotation=types[name],
-            )
+            yield _by_name(name, types[name], getattr(group, name))
 
 
 def _read(text: str | None) -> tuple[str, dict[str, tuple[str, str]], str]:
@@ -325,17 +328,16 @@ def _described(
     plain, *extras = [parameter.annotation]
     if get_origin(plain) is Annotated:
         plain, *extras = get_args(plain)
-    info: OptionInfo | ArgumentInfo
     if plain is typer.Context or any(extra.help for extra in extras):
         return parameter
+    info: OptionInfo | ArgumentInfo = typer.Argument()
     if parameter.kind is not inspect.Parameter.KEYWORD_ONLY:
-        info, (metavar, about) = typer.Argument(), helps[next(arguments)]
+        info.metavar, info.help = helps[next(arguments)]
     else:
         heading, about = helps[f"--{parameter.name.rstrip('_').replace('_', '-')}"]
-        names, metavar = re.fullmatch(r"([a-z/-]+) ?(.*)", heading).groups()  # type: ignore[union-attr]
+        names, _, metavar = heading.partition(" ")
         info = copy(extras[0]) if extras else typer.Option()
-        info.param_decls = (names,)
-    info.metavar, info.help = metavar or None, about
+        info.param_decls, info.metavar, info.help = (names,), metavar or None, about
     return parameter.replace(annotation=Annotated[plain, info])
 
 
@@ -380,11 +382,8 @@ def numbers(
     kind: Callable[[str], float] = float,
 ) -> Any:
     """Read ``66,132``."""
-
-    def read(text: str) -> list[float]:
-        return [kind(part) for part in text.split(",")]
-
-    return parsed(option, text, read, f"write {form.format(option)}")
+    form = f"write {form.format(option)}"
+    return parsed(option, text, lambda text: [kind(part) for part in text.split(",")], form)
 
 
 def whole(option: str, text: str | None) -> Any:
@@ -392,14 +391,14 @@ def whole(option: str, text: str | None) -> Any:
     return numbers(option, text, "whole numbers as in {} 1,2,4", int)
 
 
-def pair(option: str, text: str | None) -> tuple[float | None, float | None]:
-    """Read ``40:8`` or ``40``; a number that is missing is None."""
+def pair(option: str, text: str | None) -> tuple[float, float | None] | None:
+    """Read ``40:8`` or ``40``."""
 
     def read(text: str) -> tuple[float, float | None]:
         first, colon, second = text.partition(":")
         return float(first), float(second) if colon else None
 
-    return parsed(option, text, read, f"write it as {option} 40 or {option} 40:8") or (None, None)
+    return parsed(option, text, read, f"write it as {option} 40 or {option} 40:8")
 
 
 def monomer(option: str, text: str | None) -> float | Literal["auto"] | None:
@@ -409,9 +408,10 @@ def monomer(option: str, text: str | None) -> float | Literal["auto"] | None:
 
 
 _READERS: dict[str, Callable[[str, str | None], Any]] = {
-    "numbers": numbers,
-    "whole": whole,
-    "monomer": monomer,
-    "pair": pair,
+    "masses_kda": numbers,
+    "start_kda": numbers,
+    "steps": whole,
+    "ladder": monomer,
+    "limit_kda": pair,
 }
-"""How values are read whose type no command line knows."""
+"""Keywords of the library whose type no command line knows, and how their values are read."""

@@ -48,12 +48,9 @@ class Answers:
     @property
     def by_key(self) -> dict[str, float | str]:
         """Answers that are given, by key of the configuration."""
-        given = {
-            "camera.pixel_size_nm": self.pixel_size_nm,
-            "optics.wavelength_nm": self.wavelength_nm,
-            "optics.na": self.na,
-            "particle.kind": self.sample,
-        }
+        given: dict[str, float | str | None]
+        given = {"camera.pixel_size_nm": self.pixel_size_nm, "optics.na": self.na}
+        given |= {"optics.wavelength_nm": self.wavelength_nm, "particle.kind": self.sample}
         return {key: value for key, value in given.items() if value is not None}
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 from iscat_analysis.options import CommonSpecies, SpeciesOptions, only, options_of
-from iscat_cli.console import Messages, short, table
+from iscat_cli.console import Messages, listing, short
 from iscat_cli.options import Output, command, frame_range
 
 if TYPE_CHECKING:
@@ -84,38 +84,23 @@ def species(
     values = {"source": str(events[0]), **found.to_dict(), "notes": notes}
     if rates is not None:
         values["kinetics"] = rates.to_dict()
-    _show(messages, "species", values, [*_lines(found), *_rate_lines(rates)], output)
-
-
-def _show(
-    messages: Messages,
-    document: str,
-    values: dict[str, Any],
-    lines: list[RenderableType],
-    output: Output,
-) -> None:
-    """Print an answer, its notes and where it was written."""
-    folder = {} if output.out is None else {"out": str(output.out)}
-    messages.show(document, values | folder, lines)
-    messages.note(*values["notes"])
-    if output.out is not None:
-        messages.wrote(output.out, f"figures/{document.rpartition('_')[2]}.png")
+    lines = [*_lines(found), *_rate_lines(rates)]
+    folder, page = output.out, "figures/species.png"
+    messages.answer("species", values, lines, folder=folder, page=page, notes=notes)
 
 
 def _refuse_single(options: SpeciesOptions, *, rates: bool) -> None:
     """Refuse what has no meaning where tables are compared."""
     from iscat_analysis.errors import ConfigError
 
-    known, common = options_of(SpeciesOptions), options_of(CommonSpecies)
-    given = [
-        option.flag
-        for name, (_, option) in known.items()
-        if name not in common and only(SpeciesOptions, options)[name] != option.default
-    ]
-    for flag in (*given, *(["--frame-rate"] if rates else [])):
+    given = ["--frame-rate"] if rates else []
+    for name, option in options_of(SpeciesOptions).items():
+        if name not in options_of(CommonSpecies) and options.get(name) != option.default:
+            given.insert(0, option.flag)
+    if given:
         raise ConfigError(
-            f"{flag} is for a single table; where tables are compared all masses and widths are "
-            "free, and there are no rates: leave it out"
+            f"{given[0]} is for a single table; where tables are compared all masses and widths "
+            "are free, and there are no rates: leave it out"
         )
 
 
@@ -130,7 +115,8 @@ def _compare(messages: Messages, events: list[Path], output: Output, options: An
     values = comparison_document(names[0], names[1:], found, notes)
     pairs = zip(names[1:], found, strict=True)
     lines = [line for name, one in pairs for line in _comparison_lines(name, names[0], one)]
-    _show(messages, "species_comparison", values, lines, output)
+    folder, page = output.out, "figures/comparison.png"
+    messages.answer("species_comparison", values, lines, folder=folder, page=page, notes=notes)
 
 
 def _comparison_lines(name: str, first: str, found: Comparison) -> Iterator[RenderableType]:
@@ -139,64 +125,43 @@ def _comparison_lines(name: str, first: str, found: Comparison) -> Iterator[Rend
         f"{short(found.same_masses.p_value, 2)} that masses are the same, "
         f"{short(found.same_fractions.p_value, 2)} that fractions are"
     )
-    shown = table(
-        "species [kDa]",
-        "shift [kDa]",
-        "95 %",
-        "shift [%]",
-        "95 %",
-        "fraction",
-        "there",
-        "difference [%]",
-        "95 %",
+    yield listing(
+        found.species.to_dict("records"),
+        "species [kDa] | shift [kDa] | 95 % | shift [%] | 95 % | fraction | there | "
+        "difference | 95 %",
+        "{mass_kda:.4g} | {shift_kda:.3g} | {shift_low:.3g} to {shift_high:.3g} | "
+        "{shift_percent:.3g} | {shift_percent_low:.3g} to {shift_percent_high:.3g} | "
+        "{fraction:.3g%} | {fraction_other:.3g%} | {difference:.3g%} | {difference_low:.3g%} "
+        "to {difference_high:.3g%}",
     )
-    for row in found.species.to_dict("records"):
-        shown.add_row(
-            short(row["mass_kda"]),
-            short(row["shift_kda"], 3),
-            _interval(row["shift_low"], row["shift_high"], 3),
-            short(row["shift_percent"], 3),
-            _interval(row["shift_percent_low"], row["shift_percent_high"], 3),
-            f"{100 * row['fraction']:.3g} %",
-            f"{100 * row['fraction_other']:.3g} %",
-            short(100 * row["difference"], 3),
-            _interval(100 * row["difference_low"], 100 * row["difference_high"], 3),
-        )
-    yield shown
 
 
 def _lines(found: Distribution) -> Iterator[RenderableType]:
-    first = "oligomer" if found.ladder is not None else "species"
-    shown = table(
-        first, "mass [kDa]", "95 %", "width", "events", "detected", "came", "fraction", "95 %"
-    )
+    rows = []
     for number, row in enumerate(found.species.to_dict("records"), start=1):
+        interval = f"{short(row['mass_low'])} to {short(row['mass_high'])}"
+        if math.isnan(row["count_corrected"]):
+            interval = "not determined"
+        rows.append({"n": number, **row, "interval": interval})
         if row.get("background"):
-            shown.add_row("background", "–", "–", "–", short(row["count"]), "–", "–", "–", "–")
-            continue
-        undetectable = math.isnan(row["count_corrected"])
-        shown.add_row(
-            str(row.get("n", number)),
-            short(row["mass_kda"]),
-            "not determined" if undetectable else _interval(row["mass_low"], row["mass_high"]),
-            short(row["width_kda"], 3),
-            short(row["count"]),
-            f"{100 * row['efficiency']:.3g} %",
-            "–" if undetectable else short(row["count_corrected"]),
-            "–" if math.isnan(row["fraction"]) else f"{100 * row['fraction']:.3g} %",
-            _interval(100 * row["fraction_low"], 100 * row["fraction_high"], 3),
-        )
-    yield shown
-    ladder = found.ladder
-    if ladder is not None:
-        offset = ""
-        if ladder.offset_kda:
-            offset = f", offset {short(ladder.offset_kda, 3)} ± {short(ladder.offset_se, 2)} kDa"
+            only_count = {"n": "background", "count": row["count"]}
+            rows[-1] = dict.fromkeys(rows[-1]) | only_count
+    first = "oligomer" if found.ladder is not None else "species"
+    yield listing(
+        rows,
+        f"{first} | mass [kDa] | 95 % | width | events | detected | came | fraction | 95 %",
+        "{n} | {mass_kda:.4g} | {interval} | {width_kda:.3g} | {count:.4g} | {efficiency:.3g%} | "
+        "{count_corrected:.4g} | {fraction:.3g%} | {fraction_low:.3g%} to {fraction_high:.3g%}",
+    )
+    if (ladder := found.ladder) is not None:
+        offset = f", offset {short(ladder.offset_kda, 3)} ± {short(ladder.offset_se, 2)} kDa"
         error = "held" if ladder.held else f"± {short(ladder.monomer_se, 2)} kDa"
-        verdict = (
-            "" if ladder.p_value != ladder.p_value else f"; p = {ladder.p_value:.2g} of a ladder"
+        verdict = f"; p = {ladder.p_value:.2g} of a ladder"
+        yield (
+            f"monomer {short(ladder.monomer_kda, 5)} kDa ({error})"
+            f"{offset if ladder.offset_kda else ''}"
+            f"{'' if math.isnan(ladder.p_value) else verdict}"
         )
-        yield (f"monomer {short(ladder.monomer_kda, 5)} kDa ({error}){offset}{verdict}")
 
 
 def _rates(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from iscat_cli.console import Messages, print_result, short, table
+from iscat_cli.console import Messages, listing, print_result, short, table
 from iscat_cli.options import Count, Output, Seed, Setup, Written, command
 
 if TYPE_CHECKING:
@@ -100,6 +100,28 @@ class Estimators:
         return estimators
 
 
+@dataclass(frozen=True)
+class Repeated:
+    """How an experiment is repeated.
+
+    Options
+    -------
+    --trials N
+        Repetitions in each mode.
+    --seed N
+        Seed of the random numbers: the same seed gives the same result.
+    --posterior/--no-posterior
+        Sample a posterior for one in 20 repetitions.
+    --workers N
+        Threads.
+    """
+
+    trials: Annotated[int, typer.Option(min=20)] = 1000
+    seed: Annotated[int, typer.Option(min=0)] = 1
+    posterior: bool = True
+    workers: Count = None
+
+
 @command
 def benchmark(
     messages: Messages,
@@ -107,10 +129,7 @@ def benchmark(
     list_: bool = False,
     truth: Path | None = None,
     results: Path | None = None,
-    trials: Annotated[int, typer.Option(min=20)] = 1000,
-    seed: Annotated[int, typer.Option(min=0)] = 1,
-    posterior: bool = True,
-    workers: Count = None,
+    repeated: Repeated,
     estimators: Estimators,
     setup: Setup,
     output: Output,
@@ -131,14 +150,6 @@ def benchmark(
         Truth of one's own simulation, one row a particle.
     --results R.csv
         Estimates of it, to be scored.
-    --trials N
-        Repetitions in each mode.
-    --seed N
-        Seed of the random numbers: the same seed gives the same result.
-    --posterior/--no-posterior
-        Sample a posterior for one in 20 repetitions.
-    --workers N
-        Threads.
 
     Example: a thousand repetitions of one experiment; then the estimators
     that can be named, and your own simulation compared with the bounds.
@@ -173,17 +184,10 @@ def benchmark(
 
     others = estimators.found()
     check_benchmark_output(output.out, output.overwrite)
+    how: Any = {"time_limit_s": estimators.time_limit, "command": messages.command}
     with messages.progress() as progress:
         study = run_benchmark(
-            resolved,
-            trials=trials,
-            seed=seed,
-            workers=workers,
-            posterior=posterior,
-            estimators=others,
-            time_limit_s=estimators.time_limit,
-            command=messages.command,
-            progress=progress,
+            resolved, estimators=others, **vars(repeated), **how, progress=progress
         )
     write_benchmark(study, output.out, overwrite=output.overwrite)
     if estimators.archive is not None:
@@ -219,25 +223,23 @@ def benchmark_table(study: Mapping[str, Any]) -> Table:
     """Tabulate what benchmark.json holds: one row per mode and parameter."""
     from iscat_analysis.report.benchmark import MODES
 
-    rows = []
+    records = []
     for mode in MODES:
         entry = study.get(mode, {})
         for name, values in entry.items():
             if isinstance(values, Mapping) and "spread_over_crb" in values:
-                low, high = (short(end, 3) for end in values["spread_over_crb_ci95"])
-                numbers = ("bias", "spread", "crb", "qcrb", "spread_over_crb")
-                rows.append(
-                    (
-                        mode,
-                        name,
-                        *(short(values[key], 3) for key in numbers),
-                        "–" if "–" in (low, high) else f"{low}–{high}",
-                        short(values["coverage68"], 3),
-                        f"{entry['failed']} of {entry['trials']}",
-                    )
-                )
-    headings = ("bias", "spread", "CRB", "QCRB", "spread/CRB", "95 % interval", "coverage 68 %")
-    return table("mode", "parameter", *headings, "failed", rows=rows, left=(0, 1))
+                low, high = values["spread_over_crb_ci95"]
+                failed = f"{entry['failed']} of {entry['trials']}"
+                place = {"mode": mode, "name": name, "failed": failed}
+                records.append({**values, "low": low, "high": high, **place})
+    return listing(
+        records,
+        "mode | parameter | bias | spread | CRB | QCRB | spread/CRB | 95 % interval | "
+        "coverage 68 % | failed",
+        "{mode} | {name} | {bias:.3g} | {spread:.3g} | {crb:.3g} | {qcrb:.3g} | "
+        "{spread_over_crb:.3g} | {low:.3g}–{high:.3g} | {coverage68:.3g} | {failed}",
+        left=(0, 1),
+    )
 
 
 @command
@@ -340,15 +342,9 @@ def score(
 
     others = estimators.found()
     read = read_challenge(challenge, truth)
+    how: Any = {"time_limit_s": estimators.time_limit, "command": messages.command}
     with messages.progress() as progress:
-        scores = score_challenge(
-            read,
-            results or [],
-            others,
-            time_limit_s=estimators.time_limit,
-            command=messages.command,
-            progress=progress,
-        )
+        scores = score_challenge(read, results or [], others, **how, progress=progress)
     _publish(messages, scores, estimators.archive, output)
 
 
@@ -379,22 +375,26 @@ def _publish(
 
 def _scores_table(scores: Mapping[str, Any]) -> Table:
     """Tabulate efficiency and what belongs to it, one row for each parameter of each estimator."""
-    headings = ("efficiency", "95 %", "bias", "rmse", "CRB", "QCRB", "pull σ", "answered")
-    rows = []
+    numbers = ("efficiency_crb", "low", "high", "bias", "rmse", "crb", "qcrb", "pull_std")
+    records: list[dict[str, Any]] = []
     for part, entries in scores["parts"].items():
         for who, entry in entries["estimators"].items():
-            if entry["failed"] == entry["trials"]:
-                nothing = ["–"] * len(headings)
-                rows.append([part, who, *nothing, f"0 of {entry['trials']}"])
+            place, trials = {"part": part, "who": who}, entry["trials"]
+            if entry["failed"] == trials:
+                nothing = {**dict.fromkeys(numbers), "name": "–", "answered": 0}
+                records.append({**nothing, **place, "trials": trials})
             for name, found in entry.items():
-                if not isinstance(found, Mapping) or "efficiency_crb" not in found:
-                    continue
-                low, high = (short(end, 3) for end in found["efficiency_crb_ci95"])
-                numbers = (short(found[k], 3) for k in ("bias", "rmse", "crb", "qcrb", "pull_std"))
-                best = (short(found["efficiency_crb"], 3), f"{low}–{high}")
-                answered = f"{found['answered']} of {entry['trials']}"
-                rows.append([part, who, name, *best, *numbers, answered])
-    return table("part", "estimator", "parameter", *headings, rows=rows)
+                if isinstance(found, Mapping) and "efficiency_crb" in found:
+                    low, high = found["efficiency_crb_ci95"]
+                    ends = {"low": low, "high": high}
+                    records.append({**found, **ends, **place, "name": name, "trials": trials})
+    return listing(
+        records,
+        "part | estimator | parameter | efficiency | 95 % | bias | rmse | CRB | QCRB | pull σ"
+        " | answered",
+        "{part} | {who} | {name} | {efficiency_crb:.3g} | {low:.3g}–{high:.3g} | {bias:.3g} |"
+        " {rmse:.3g} | {crb:.3g} | {qcrb:.3g} | {pull_std:.3g} | {answered} of {trials}",
+    )
 
 
 def _ranking(study: Mapping[str, Any]) -> Table:

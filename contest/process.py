@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis.executors import Executor, LocalExecutor
+from iscat_analysis.executors import Executor
 from iscat_analysis.reading import first_line
 from iscat_analysis.records import FloatArray, Progress, silent
 from iscat_analysis.study import EstimatorSetup, Setting, setup_of
@@ -119,7 +119,7 @@ def run_estimators(
     progress: Progress,
 ) -> dict[str, list[Answer]]:
     """Give all estimators the same jobs; their answers, by name."""
-    place = executor or LocalExecutor()
+    place = executor or Executor()
     paths = [path for path in sys.path if path]
 
     def work(estimator: Estimator) -> list[Answer]:

@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from iscat_analysis.errors import ConfigError, DataError, SchedulerError
 from iscat_analysis.reading import read_json
@@ -35,10 +35,8 @@ if TYPE_CHECKING:
 THREADS = "threads"
 """The scheduler that is this process."""
 
-DEPENDENCIES = (
-    "numpy", "scipy", "scikit-image", "numba", "tifffile", "emcee", "arviz-stats", "pandas",
-    "pyarrow", "matplotlib",
-)  # fmt: skip
+_PACKAGES = "numpy scipy scikit-image numba tifffile emcee arviz-stats pandas pyarrow matplotlib"
+DEPENDENCIES = tuple(_PACKAGES.split())
 """Packages whose versions are part of a result."""
 
 CONNECT_S = 4.0
@@ -64,12 +62,11 @@ def versions() -> dict[str, str]:
     }
 
 
-class Executor(Protocol):
-    """Where jobs run."""
+class Executor:
+    """Runs jobs in this process, one after the other."""
 
-    @property
-    def distant(self) -> bool:
-        """Whether jobs run in other processes, which read movies by their paths."""
+    distant = False
+    """Whether jobs run in other processes, which read movies by their paths."""
 
     def call(
         self,
@@ -80,42 +77,20 @@ class Executor(Protocol):
         here: Callable[[], R] | None = None,
     ) -> R:
         """Do a job and wait for it; `here` does the same with what this process holds already."""
-
-    def each(self, work: Callable[[T], R], items: Sequence[T]) -> Generator[tuple[int, R]]:
-        """Apply a function to every item, in parallel where jobs run elsewhere."""
-
-    def warnings(self, memory_limit_mb: int) -> list[str]:
-        """List what the user should know before work begins."""
-
-
-class LocalExecutor:
-    """Runs jobs in this process, one after the other."""
-
-    distant = False
-
-    def call(
-        self,
-        job: Callable[..., R],
-        /,
-        *arguments: Any,
-        progress: Progress = silent,
-        here: Callable[[], R] | None = None,
-    ) -> R:
-        """Do a job; see `Executor`."""
         return here() if here is not None else job(*arguments, progress=progress)
 
     def each(self, work: Callable[[T], R], items: Sequence[T]) -> Generator[tuple[int, R]]:
-        """Do something with every item, in order; see `Executor`."""
+        """Apply a function to every item, in parallel where jobs run elsewhere."""
         for number, item in enumerate(items):
             yield number, work(item)
 
     def warnings(self, memory_limit_mb: int) -> list[str]:
-        """Return no warnings; see `Executor`."""
+        """List what the user should know before work begins."""
         del memory_limit_mb
         return []
 
 
-class DaskExecutor:
+class DaskExecutor(Executor):
     """The workers of a Dask cluster; `open_executor` connects to one."""
 
     distant = True
@@ -145,26 +120,21 @@ class DaskExecutor:
 
     def warnings(self, memory_limit_mb: int) -> list[str]:
         """Say which workers are missing or have too little memory; see `Executor`."""
-        link = self._dashboard()
+        services = self._client.scheduler_info().get("services", {})
+        link = self._client.dashboard_link if "dashboard" in services else None
         shown = [f"the dashboard of the cluster is {link}"] if link else []
         if not self._memory:
             return [*shown, f"{self._address} has no workers yet; the work begins with the first"]
         needed = memory_limit_mb + _BASE_MB
         least = min(self._memory, key=lambda worker: self._memory[worker] or float("inf"))
         megabytes = self._memory[least] / 1e6
-        if not 0 < megabytes < needed:
-            return shown
-        return [
-            *shown,
-            f"worker {least} may use {megabytes:.0f} MB of memory, and "
-            f"compute.memory_limit_mb = {memory_limit_mb} with the program itself may take "
-            f"{needed}: start workers with more, or lower compute.memory_limit_mb",
-        ]
-
-    def _dashboard(self) -> str:
-        """Give the page that shows what workers do; empty where the cluster has none."""
-        services = self._client.scheduler_info().get("services", {})
-        return str(self._client.dashboard_link or "") if "dashboard" in services else ""
+        if 0 < megabytes < needed:
+            shown.append(
+                f"worker {least} may use {megabytes:.0f} MB of memory, and "
+                f"compute.memory_limit_mb = {memory_limit_mb} with the program itself may take "
+                f"{needed}: start workers with more, or lower compute.memory_limit_mb"
+            )
+        return shown
 
     def call(
         self,
@@ -241,12 +211,9 @@ class DaskExecutor:
 
 def _compare(ours: dict[str, str], theirs: dict[str, str], worker: str) -> None:
     """Refuse a worker whose results would differ."""
-    other = [
-        f"{name} {theirs.get(name, 'missing')} (here {ours[name]})"
-        for name in ours
-        if theirs.get(name, "missing") != ours[name]
-    ]
-    if theirs.get("iscat-analysis") == "missing":
+    has = {name: theirs.get(name, "missing") for name in ours}
+    other = [f"{name} {has[name]} (here {ours[name]})" for name in ours if has[name] != ours[name]]
+    if has["iscat-analysis"] == "missing":
         other = [f"no iscat-analysis (here {ours['iscat-analysis']})"]
     if other:
         raise ConfigError(
@@ -299,7 +266,7 @@ def open_executor(
             )
         scheduler = _address_in(Path(scheduler_file))
     elif scheduler == THREADS:
-        yield LocalExecutor()
+        yield Executor()
         return
     elif ":" not in scheduler:
         raise ConfigError(

@@ -40,16 +40,7 @@ from iscat_analysis.records import (
     silent,
     tally,
 )
-from iscat_analysis.report import check_output, write_report
-from iscat_analysis.report.answer import (
-    as_contrasts,
-    caution,
-    headline,
-    label_of,
-    main_quantity,
-    precision_of,
-    tracks_of,
-)
+from iscat_analysis.report import answer, check_output, write_report
 from iscat_analysis.report.exchange import to_napari, to_trackpy
 from iscat_analysis.report.figures import draw, draw_corner, draw_view, posterior_of, view_of
 from iscat_analysis.report.numbers import UNITS, number
@@ -65,20 +56,16 @@ ROWS_SHOWN = 20
 """Events that a `Result` shows of itself in a notebook."""
 
 _COLUMNS = ("event", "frame", "x_px", "y_px", "z_nm", "mass_kda")
-_TRACK_COLUMNS = (
-    "track",
-    "first_frame",
-    "last_frame",
-    "n_frames",
+_MEASURED = (
     "mass_kda",
     "sigma_mass_kda",
     "crb_mass_kda",
     "d_um2_s",
     "sigma_d_um2_s",
     "crb_d_um2_s",
-    "diameter_nm",
-    "sigma_diameter_nm",
 )
+_OF_TRACK = ("track", "first_frame", "last_frame", "n_frames")
+_TRACK_COLUMNS = (*_OF_TRACK, *_MEASURED, "diameter_nm", "sigma_diameter_nm")
 
 
 @dataclass(frozen=True, repr=False)
@@ -101,7 +88,7 @@ class Result:
     @property
     def tracks(self) -> pd.DataFrame:
         """Mode ``track``: one row per track, the columns of ``tracks.csv``; else empty."""
-        return tracks_of(self.analysis)
+        return answer.tracks_of(self.analysis)
 
     @property
     def summary(self) -> Mapping[str, Any]:
@@ -312,26 +299,24 @@ class Result:
 
     def _facts(self) -> list[tuple[str, str]]:
         table, tracked = event_table(self.analysis), self.analysis.tracks is not None
-        facts = [("", text) for text in headline(self.analysis, table)] if len(self) else []
+        facts = [("", text) for text in answer.headline(self.analysis, table)] if len(self) else []
         rows = tally(self.tracks if tracked else table)
         facts.append(("status", rows.text("track" if tracked else "event")))
-        for name in FREE_PARAMETERS[self.mode] if caution(table) is None else ():
-            p = precision_of(self.analysis, table, name)
+        for name in FREE_PARAMETERS[self.mode] if answer.caution(table) is None else ():
+            p = answer.precision_of(self.analysis, table, name)
             if p.events:
                 text = f"σ {number(p.sigma)}{p.shared}, CRB {number(p.crb)}"
                 text += f", Holevo {number(p.holevo)}" if math.isfinite(p.holevo) else ""
                 text += f", QCRB {number(p.qcrb)}"
-                facts.append((label_of(self.analysis, name), f"{text} {UNITS[name]} (medians)"))
+                facts.append(
+                    (answer.label_of(self.analysis, name), f"{text} {UNITS[name]} (medians)")
+                )
         return facts + [("warning", text) for text in self.warnings]
 
     def __repr__(self) -> str:
-        lines = [
-            line
-            for name, text in self._facts()
-            for line in textwrap.wrap(
-                f"{name} {text}".strip(), 78, initial_indent="  ", subsequent_indent="    "
-            )
-        ]
+        wrap = textwrap.TextWrapper(78, initial_indent="  ", subsequent_indent="    ").wrap
+        facts = (wrap(f"{name} {text}".strip()) for name, text in self._facts())
+        lines = [line for fact in facts for line in fact]
         looks = ".view(0), .histogram(), .posterior(0)"
         if self.analysis.tracks is not None:
             looks = ".tracks, .overview(), .view(0), .histogram()"
@@ -349,12 +334,11 @@ class Result:
         if self.analysis.tracks is not None:
             names, listed = [*_TRACK_COLUMNS, "status"], self.tracks
         shown = listed.head(ROWS_SHOWN)
-        if main_quantity(self.analysis).column == "contrast":
-            shown = as_contrasts(shown)
-        shown = shown[names]
-        if main_quantity(self.analysis).column == "contrast":
+        if answer.main_quantity(self.analysis).column == "contrast":
             new = {"mass_kda": "contrast", "sigma_mass_kda": "sigma_contrast"}
-            shown = shown.rename(columns=new)
+            shown = answer.as_contrasts(shown)[names].rename(columns=new)
+        else:
+            shown = shown[names]
         rest = len(listed) - len(shown)
         where = ".table" if listed is self.table else ".tracks"
         more = f"<p>… and {rest} more in <code>{where}</code></p>" if rest else ""
@@ -581,22 +565,12 @@ def calibrate_optics(
     overwrite = truth_in("`overwrite`", overwrite)
     if focus_step_nm is not None:
         number_in("`focus_step_nm`", focus_step_nm, least=-LARGEST_NM, most=LARGEST_NM)
+    learned: Any = {"free": free, "focus_step_nm": focus_step_nm, "progress": progress}
     if out is not None:
-        folder = path_in("`out`", out)
-        return optics_calibration(
-            movie,
-            resolved,
-            folder,
-            name=name,
-            free=free,
-            focus_step_nm=focus_step_nm,
-            overwrite=overwrite,
-            progress=progress,
-        )
+        learned |= {"name": name, "overwrite": overwrite}
+        return optics_calibration(movie, resolved, path_in("`out`", out), **learned)
     with open_stack(movie, name=name) as stack:
-        return calibrate_movie(
-            stack, resolved, free=free, focus_step_nm=focus_step_nm, progress=progress
-        )
+        return calibrate_movie(stack, resolved, **learned)
 
 
 def simulate_movie(

@@ -1,9 +1,12 @@
-"""Units and their conversions, each defined once; numbers with what they count."""
+"""Units and their conversions, each defined once; numbers in words and in cells of tables."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Mapping
+from string import Formatter
+from typing import Any
 
 NM = 1e-9
 """One nanometre in metres."""
@@ -44,3 +47,29 @@ def frames_listed(numbers: Iterable[object]) -> str:
     """Write the numbers of the first four frames, and how many more there are."""
     numbers = list(numbers)
     return f"frame{'' if len(numbers) == 1 else 's'} {listed(numbers, 4)}"
+
+
+_NO_RANGE = re.compile("–( to |–)–")
+
+
+class _Cells(Formatter):
+    """Formats as `str.format` does, and with a dash for numbers that are not known.
+
+    ``.3g%`` makes percent of a share, with three digits; digits are grouped by spaces.
+    """
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if value is None or (isinstance(value, float) and not math.isfinite(value)):
+            return "–"
+        if format_spec.endswith(("f%", "g%")):
+            return f"{100 * value:{format_spec[:-1]}} %"
+        text = str(super().format_field(value, format_spec))
+        return text.replace(",", " ") if "," in format_spec else text
+
+
+def cells(records: Iterable[Mapping[str, Any]], row: str) -> list[tuple[str, ...]]:
+    """Write the cells of a table: `row` has the formats of a record's values, between bars."""
+    formats, write = row.split(" | "), _Cells().vformat
+    return [
+        tuple(_NO_RANGE.sub("–", write(form, (), record)) for form in formats) for record in records
+    ]

@@ -16,19 +16,10 @@ import pandas as pd
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import find_peaks, peak_prominences
 
-from iscat_analysis.answers.output import Notify, folder_for, tell, write_answer
+from iscat_analysis.answers.output import Notify, folder_for, tell
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.findings import Finding, existing
-from iscat_analysis.findings.tables import (
-    INACTIVE_PART,
-    MONOMER_TAKEN,
-    MOVIES_LEFT_OUT,
-    NO_EQUILIBRIUM,
-    NO_LOWER_END,
-    NO_UPPER_END,
-    OTHER_SPECIES,
-    SINGLE_TABLE,
-)
+from iscat_analysis.findings import tables as said
 from iscat_analysis.inference.checks import LARGEST, choice_in, number_in, path_in, truth_in
 from iscat_analysis.movie import path_beside, split_address
 from iscat_analysis.movie.text_tables import read_frame, refuse_twice
@@ -50,15 +41,13 @@ from iscat_analysis.species.tables import EventTable, event_table, mass_in, refu
 from iscat_analysis.text import from_table, in_table
 from iscat_analysis.units import count
 
-BINDING_FILES = frozenset({"kd.csv", "kd.json", "figures"})
-"""Everything `fit_kd` may leave in its folder."""
-
 CONCENTRATIONS: dict[Model, tuple[str, ...]] = {
     "dimer": ("concentration_nm",),
     "ab": ("a_nm", "b_nm"),
 }
 """Columns of the samples that hold concentrations [nM]."""
 
+_OF_TABLES = ("complexes", "complexes_low", "complexes_high", "predicted", "pull", "background")
 _WRONG = 0.01  # p-value below which the model is doubted
 _FAR = 3.0  # standard errors of a table that is named
 _OTHER_MASS = 0.15  # of a mass that was given: farther away is another species
@@ -99,27 +88,15 @@ class Binding:
         dict
             Nested plain values.
         """
-        fit = self.fit
+        left_out = {*_OF_TABLES, "detected", "profile_ln_kd", "profile_deviance"}
+        fit = {name: value for name, value in vars(self.fit).items() if name not in left_out}
+        profile = {"ln_kd_nm": self.fit.profile_ln_kd, "deviance": self.fit.profile_deviance}
         return {
             "model": self.model,
-            "kd_nm": fit.kd_nm,
-            "kd_low": fit.kd_low,
-            "kd_high": fit.kd_high,
-            "inactive": fit.inactive,
-            "inactive_se": fit.inactive_se,
-            "inactive_p": fit.inactive_p,
-            "masses_kda": fit.masses_kda,
-            "width_kda": fit.width_kda,
-            "tail_kda": fit.tail_kda,
-            "limit_kda": fit.limit_kda,
-            "landing_power": fit.landing_power,
-            "landing_power_se": fit.landing_power_se,
-            "chi2": fit.chi2,
-            "dof": fit.dof,
-            "p_value": fit.p_value,
+            **fit,
             "samples": self.samples.to_dict("records"),
             "curve": self.curve.to_dict("list"),
-            "profile": {"ln_kd_nm": fit.profile_ln_kd, "deviance": fit.profile_deviance},
+            "profile": profile,
             "notes": list(self.notes),
         }
 
@@ -190,14 +167,15 @@ def fit_kd(
     if power is not None and not -1 <= number_in("`landing_power`", power) <= 1:
         raise ConfigError(f"`landing_power` = {power:g}: must lie between -1 and 1, as in -0.167")
     truth_in("`inactive`", options["inactive"])
-    folder = folder_for(out, BINDING_FILES, overwrite=overwrite)
+    folder = folder_for(out, "kd.csv", "kd.json", "figures", overwrite=overwrite)
     name = "samples" if isinstance(samples, pd.DataFrame) else str(samples)
     rows, totals, found, findings = _series(samples, name, model, tables, options)
     masses, about = _masses(found, model, options["masses_kda"])
+    events = [_to_fit(table) for table in found]
+    inactive = options["inactive"]
     fit = fit_equilibrium(
-        [_to_fit(table) for table in found], totals, model=model, masses_kda=masses, power=power,
-        inactive=options["inactive"],
-    )  # fmt: skip
+        events, totals, model=model, masses_kda=masses, power=power, inactive=inactive
+    )
     lightest = int(np.argmin(fit.masses_kda))
     if fit.detected[lightest] < LEAST_EFFICIENCY:
         raise DataError(
@@ -209,17 +187,14 @@ def fit_kd(
     notes = [
         *(finding.text for finding in existing([*findings, about])),
         *sentences(finding for table in found for finding in table.findings),
-        *(finding.text for finding in _doubts(found, fit, masses, inactive=options["inactive"])),
+        *(finding.text for finding in _doubts(found, fit, masses, inactive=inactive)),
     ]
     samples_table = _laid_out(rows, found, fit)
     result = Binding(model, fit, samples_table, _curve(totals, fit, model), tuple(notes))
     tell(notes, notify)
     contents = {"source": name, **result.to_dict()}
     files = {"kd.csv": in_table(result.samples), "kd.json": ("kd", contents)}
-    write_answer(
-        folder, BINDING_FILES, files, lambda: binding_figure(jsonable(contents)),
-        overwrite=overwrite,
-    )  # fmt: skip
+    folder.write(files, lambda: binding_figure(jsonable(contents)))
     return result
 
 
@@ -250,13 +225,10 @@ def _series(
         sources = [table for table, keep in zip(tables, kept, strict=True) if keep]
     else:
         raise ConfigError(f"`tables`: give a list with one for each of {kept.size} rows")
-    found = [
-        event_table(
-            table, name=None if isinstance(table, Path) else f"table {number + 1}",
-            **only(EventOptions, options),
-        )
-        for number, table in enumerate(sources)
-    ]  # fmt: skip
+    known = only(EventOptions, options)
+    numbered = enumerate(sources, start=1)
+    called = ((one, None if isinstance(one, Path) else f"table {n}") for n, one in numbered)
+    found = [event_table(table, name=name, **known) for table, name in called]
     enough, few = with_events(found)
     if of_batch and any(enough):
         findings += existing([few])
@@ -326,7 +298,7 @@ def with_events(tables: Sequence[EventTable]) -> tuple[list[bool], Finding | Non
     enough = [table.mass_kda.size >= LEAST_EVENTS for table in tables]
     few = [table.name for table, keep in zip(tables, enough, strict=True) if not keep]
     why = {"why": f"with less than {LEAST_EVENTS} events", "names": ", ".join(few)}
-    return enough, MOVIES_LEFT_OUT(why) if few else None
+    return enough, said.MOVIES_LEFT_OUT(why) if few else None
 
 
 def _analysed(
@@ -339,7 +311,7 @@ def _analysed(
         given[:] = True  # that a column is missing is said of the whole table
     names = rows["movie"] if "movie" in rows else rows["path"] if "path" in rows else rows["report"]
     findings = [
-        MOVIES_LEFT_OUT({"why": why, "names": ", ".join(names[gone].astype(str))})
+        said.MOVIES_LEFT_OUT({"why": why, "names": ", ".join(names[gone].astype(str))})
         for why, gone in (
             ("not analysed", given & ~has_result),
             (f"without {' and '.join(columns)}", ~given),
@@ -385,9 +357,12 @@ def _paths(rows: pd.DataFrame, base: Path | None, name: str) -> list[Path]:
         path = Path(given.strip())
         path = path.parent if column == "report" else path
         places = [path if base is None else base / path, path]
-        results = (_result_of(place) for place in places)
-        there = (place for place in places if _is_there(split_address(place)[0]))
-        found.append(next((each for each in results if each), next(there, path)))
+        results = filter(None, map(_result_of, places))
+        files = (split_address(place)[0] for place in places)
+        there = (
+            p for p, file in zip(places, files, strict=True) if is_file(file) or is_folder(file)
+        )
+        found.append(next(results, None) or next(there, path))
     return found
 
 
@@ -402,10 +377,6 @@ def _result_of(movie: Path) -> Path | None:
     return folder if len({file.suffix.lower() for file in files}) == 1 else None
 
 
-def _is_there(path: Path) -> bool:
-    return is_file(path) or is_folder(path)
-
-
 def _to_fit(table: EventTable) -> Events:
     """Select a table's events; without a limit of detection, it is fitted too."""
     return replace(table.events, efficiency=None) if table.edge_kda is not None else table.events
@@ -415,15 +386,8 @@ def _laid_out(
     rows: pd.DataFrame, tables: Sequence[EventTable], fit: EquilibriumFit
 ) -> pd.DataFrame:
     kept = rows if "path" in rows else rows.assign(path=[table.name for table in tables])
-    return kept.assign(
-        events=[table.mass_kda.size for table in tables],
-        complexes=fit.complexes,
-        complexes_low=fit.complexes_low,
-        complexes_high=fit.complexes_high,
-        predicted=fit.predicted,
-        pull=fit.pull,
-        background=fit.background,
-    )
+    events = [table.mass_kda.size for table in tables]
+    return kept.assign(events=events, **{name: getattr(fit, name) for name in _OF_TABLES})
 
 
 def _curve(totals: FloatArray, fit: EquilibriumFit, model: Model) -> pd.DataFrame:
@@ -447,19 +411,19 @@ def _doubts(
     """Doubt the constant."""
     for given, fitted in zip(masses_kda, fit.masses_kda.tolist(), strict=False):
         if abs(fitted / given - 1) > _OTHER_MASS:
-            yield OTHER_SPECIES({"given_kda": given, "found_kda": fitted})
+            yield said.OTHER_SPECIES({"given_kda": given, "found_kda": fitted})
     if fit.p_value < _WRONG:
         far = [t.name for t, pull in zip(tables, fit.pull, strict=True) if abs(pull) > _FAR]
         named = f" (farthest: {', '.join(far[:3])})" if far else ""
-        yield NO_EQUILIBRIUM({"p_value": fit.p_value, "farthest": named})
+        yield said.NO_EQUILIBRIUM({"p_value": fit.p_value, "farthest": named})
     if not inactive and fit.inactive_p < _WRONG:
-        yield INACTIVE_PART({"p_value": fit.inactive_p})
+        yield said.INACTIVE_PART({"p_value": fit.inactive_p})
     if not math.isfinite(fit.kd_high):
-        yield NO_UPPER_END()
+        yield said.NO_UPPER_END()
     if fit.kd_low == 0:
-        yield NO_LOWER_END()
+        yield said.NO_LOWER_END()
     if len(tables) < 2:
-        yield SINGLE_TABLE()
+        yield said.SINGLE_TABLE()
 
 
 _POSSIBLE_PEAKS = (0.0, 11.5)  # ln of masses in kDa
@@ -504,4 +468,4 @@ def monomer_of(tables: Sequence[EventTable]) -> tuple[float, Finding]:
     _, one, two = max(pairs)
     # The dimer's peak is whole where that of the monomer may be cut by what is missed.
     taken = {"monomer_kda": float(masses[one]), "dimer_kda": float(masses[two])}
-    return float(masses[two]) / 2, MONOMER_TAKEN(taken)
+    return float(masses[two]) / 2, said.MONOMER_TAKEN(taken)

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.answers.output import Notify, folder_for, tell, write_answer
+from iscat_analysis.answers.output import Writing, folder_for, tell
 from iscat_analysis.calibration import (
     LEAST_EVENTS,
     ContrastPeak,
@@ -31,32 +31,11 @@ from iscat_analysis.instrument.template import MeasuredPicture, measure_template
 from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.optics.measured import sha256_of
-from iscat_analysis.records import FloatArray, Progress, silent
+from iscat_analysis.records import FloatArray
 from iscat_analysis.report.calibration import camera_page, mass_page, optics_page, template_page
 from iscat_analysis.schemas import jsonable
 
-CAMERA_FILES = frozenset(
-    {
-        "camera.json",
-        "camera.toml",
-        "camera.html",
-        "gain_e_per_adu.tif",
-        "offset_adu.tif",
-        "read_noise_e.tif",
-        "masked.tif",
-    }
-)
-"""Everything a camera calibration may leave in its folder."""
-
-MASS_FILES = frozenset({"calibration.json", "calibration.toml", "calibration.html"})
-"""Everything a mass calibration may leave in its folder."""
-
-OPTICS_FILES = frozenset({"optics.json", "optics.toml", "optics.html"})
-"""Everything a calibration of the optics may leave in its folder."""
-
-TEMPLATE_FILES = frozenset({"template.json", "template.npz", "template.html", "optics.toml"})
-"""Everything a measured picture may leave in its folder."""
-
+_MAPS = ("gain_e_per_adu.tif", "offset_adu.tif", "read_noise_e.tif", "masked.tif")
 _BINS = 120
 
 
@@ -67,33 +46,32 @@ def camera_calibration(
     dark: Path | None = None,
     offset_adu: float | None = None,
     maps: bool = False,
-    overwrite: bool = False,
-    progress: Progress = silent,
-    notify: Notify | None = None,
+    **writing: Unpack[Writing],
 ) -> CameraCalibration:
     """Calibrate a camera from recordings and write what was found."""
-    folder_for(out, CAMERA_FILES, overwrite=overwrite)
+    names = ("camera.json", "camera.toml", "camera.html", *_MAPS)
+    folder = folder_for(out, *names, **writing)
     with ExitStack() as opened:
         light = [opened.enter_context(open_stack(path)) for path in stacks]
         shade = opened.enter_context(open_stack(dark)) if dark is not None else None
         found = measure_camera(
-            light, dark=shade, offset_adu=offset_adu, maps=maps, progress=progress
+            light, dark=shade, offset_adu=offset_adu, maps=maps, progress=folder.progress
         )
-    tell(found.notes, notify)
-    names = {key: f"{key}.tif" for key in found.maps}
-    title = ", ".join(path.name for path in (*stacks, *([dark] if dark else [])))
+    tell(found.notes, folder.notify)
+    paths = [*stacks, *([dark] if dark else [])]
     contents = {"recordings": [str(p) for p in stacks], "dark": str(dark) if dark else None}
     contents |= found.to_dict()
-    toml = found.to_toml(names)
-    masked = np.logical_or.reduce(list(found.masked.values())).astype(np.uint8) if maps else None
-    files = {
+    toml = found.to_toml({key: f"{key}.tif" for key in found.maps})
+    files: dict[str, Any] = {
         "camera.json": ("camera", contents),
         "camera.toml": toml,
-        **{names[key]: values.astype(np.float32) for key, values in found.maps.items()},
-        "masked.tif": masked,
-        "camera.html": camera_page(title, jsonable(contents), toml),
+        **{f"{key}.tif": values.astype(np.float32) for key, values in found.maps.items()},
+        "camera.html": camera_page(", ".join(p.name for p in paths), jsonable(contents), toml),
     }
-    write_answer(out, CAMERA_FILES, files, overwrite=overwrite)
+    if maps:
+        masked = np.logical_or.reduce(list(found.masked.values()))
+        files["masked.tif"] = masked.astype(np.uint8)
+    folder.write(files)
     return found
 
 
@@ -105,55 +83,52 @@ def optics_calibration(
     name: str | None = None,
     free: str | Sequence[str] | None = None,
     focus_step_nm: float | None = None,
-    overwrite: bool = False,
-    progress: Progress = silent,
-    notify: Notify | None = None,
+    **writing: Unpack[Writing],
 ) -> OpticsCalibration:
     """Learn the optics from a movie and write what was found.
 
     Shapes: `movie` (t, y, x).
     """
-    folder_for(out, OPTICS_FILES, overwrite=overwrite)
+    names = ("optics.json", "optics.toml", "optics.html")
+    folder = folder_for(out, *names, **writing)
     with open_stack(movie, name=name) as stack:
         title = stack.path.name
         found = calibrate_movie(
-            stack, config, free=free, focus_step_nm=focus_step_nm, progress=progress, notify=notify
+            stack,
+            config,
+            free=free,
+            focus_step_nm=focus_step_nm,
+            progress=folder.progress,
+            notify=folder.notify,
         )
-    tell([note.text for note in found.notes], notify)
-    contents = found.to_dict()
-    toml = found.to_toml()
+    tell([note.text for note in found.notes], folder.notify)
+    contents, toml = found.to_dict(), found.to_toml()
     files = {
         "optics.json": ("optics", contents),
         "optics.toml": toml if found.accepted else None,
         "optics.html": optics_page(title, jsonable(contents), toml),
     }
-    write_answer(out, OPTICS_FILES, files, overwrite=overwrite)
+    folder.write(files)
     return found
 
 
 def template_calibration(
-    movie: Path,
-    config: Config,
-    out: Path,
-    *,
-    overwrite: bool = False,
-    progress: Progress = silent,
-    notify: Notify | None = None,
+    movie: Path, config: Config, out: Path, **writing: Unpack[Writing]
 ) -> MeasuredPicture:
     """Measure the picture of a particle in a movie and write what was found."""
-    folder_for(out, TEMPLATE_FILES, overwrite=overwrite)
+    names = ("template.json", "template.npz", "template.html", "optics.toml")
+    folder = folder_for(out, *names, **writing)
     with open_stack(movie) as stack:
-        found = measure_template(stack, config, progress=progress, notify=notify)
-    content = found.template.to_bytes()
+        found = measure_template(stack, config, progress=folder.progress, notify=folder.notify)
+    content, contents = found.template.to_bytes(), found.to_dict()
     toml = found.to_toml("template.npz", sha256_of(content))
-    contents = found.to_dict()
     files = {
         "template.json": ("template", contents),
         "template.npz": content if found.accepted else None,
         "optics.toml": toml if found.accepted else None,
         "template.html": template_page(movie.name, jsonable(contents), found.template, toml),
     }
-    write_answer(out, TEMPLATE_FILES, files, overwrite=overwrite)
+    folder.write(files)
     return found
 
 
@@ -166,15 +141,15 @@ def mass_calibration(
     peaks_at: Sequence[float] | None = None,
     landing: Landing | None = None,
     standards: Config | None = None,
-    overwrite: bool = False,
-    notify: Notify | None = None,
+    **writing: Unpack[Writing],
 ) -> MassCalibration:
     """Calibrate contrast against standards and write what was found.
 
     The configuration of their analysis, which says with what optics they were measured, is that
     beside ``fits.csv`` where none is given.
     """
-    folder_for(out, MASS_FILES, overwrite=overwrite)
+    names = ("calibration.json", "calibration.toml", "calibration.html")
+    folder = folder_for(out, *names, **writing)
     table = read_contrasts(events)
     contrast = table["contrast"].to_numpy(float)
     if landing is None:
@@ -191,11 +166,11 @@ def mass_calibration(
     )
     standards = made_with(table) if standards is None else standards
     if standards is None:
-        findings = (*found.findings, NO_RECORDED_OPTICS(where=str(events)))
-        found = replace(found, findings=findings)
+        unknown = NO_RECORDED_OPTICS(where=str(events))
+        found = replace(found, findings=(*found.findings, unknown))
     else:
         found = replace(found, recorded=standards_of(standards))
-    tell(found.notes, notify)
+    tell(found.notes, folder.notify)
     direction = -1.0 if found.landing == "dark" else 1.0
     size = direction * contrast[direction * contrast > 0]
     top = 1.25 * max(peak.contrast for peak in found.peaks)
@@ -211,7 +186,7 @@ def mass_calibration(
         "calibration.toml": toml,
         "calibration.html": mass_page(events.name, jsonable(contents), toml),
     }
-    write_answer(out, MASS_FILES, files, overwrite=overwrite)
+    folder.write(files)
     return found
 
 
@@ -222,14 +197,12 @@ def contrast_peaks(events: Path) -> tuple[FloatArray, list[ContrastPeak]]:
     """
     table = read_contrasts(events)
     contrast = table["contrast"].to_numpy(float)
-    lands = contrast > 0
-    if _landing(contrast, table["mass_kda"].to_numpy(float)) == "dark":
-        lands = contrast < 0
-    size = np.abs(contrast[lands])
+    sign = 1 if _landing(contrast, table["mass_kda"].to_numpy(float)) == "bright" else -1
+    size = sign * contrast
     sigma = np.zeros(size.shape)
     if "sigma_contrast" in table:
-        sigma = table["sigma_contrast"].to_numpy(float)[lands]
-    known = np.isfinite(size) & np.isfinite(sigma)
+        sigma = table["sigma_contrast"].to_numpy(float)
+    known = (size > 0) & np.isfinite(size) & np.isfinite(sigma)
     if np.count_nonzero(known) < LEAST_EVENTS:
         return size[known], []
     return size[known], find_contrast_peaks(size[known], sigma[known])

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias, Unpack
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.answers.output import Notify, folder_for, tell, write_answer
+from iscat_analysis.answers.output import Notify, folder_for, tell
 from iscat_analysis.answers.species import choice_of
 from iscat_analysis.errors import DataError
 from iscat_analysis.findings.tables import MANY_COMPARISONS, SCALE_NOT_IN_SHIFTS
@@ -32,9 +32,6 @@ from iscat_analysis.species.tables import EventTable, event_table, sentences
 from iscat_analysis.text import in_table
 from iscat_analysis.threads import processors, threads
 from iscat_analysis.units import count
-
-COMPARISON_FILES = frozenset({"comparison.csv", "comparison.json", "figures"})
-"""Everything `compare_tables` may leave in its folder."""
 
 Table: TypeAlias = str | Path | pd.DataFrame | EventTable
 """What may be compared."""
@@ -131,7 +128,8 @@ def compare_tables(
     The species are chosen once, on events of all tables, at most `_MOST_POOLED` evenly from each.
     """
     choice = choice_of(defaults(SpeciesOptions) | options)
-    folder = folder_for(out, COMPARISON_FILES, overwrite=overwrite)
+    names = ("comparison.csv", "comparison.json", "figures")
+    folder = folder_for(out, *names, overwrite=overwrite)
     if workers is not None:
         workers = int(number_in("`workers`", workers, least=1, most=_MOST_WORKERS, whole=True))
     if not isinstance(tables, (list, tuple)) or len(tables) < 2:
@@ -148,17 +146,11 @@ def compare_tables(
         read.append(one)
         progress("read", number + 1, len(tables))
     chosen = choice.choose(_pooled(read))
-    done = 0
-
-    def pair(other: EventTable) -> Comparison:
-        nonlocal done
-        found = compare(read[0].events, other.events, chosen.best)
-        done += 1
-        progress("compare", done, len(read) - 1)
-        return found
-
+    found = []
     with threads(workers or processors()) as pool:
-        found = list(pool.map(pair, read[1:]))
+        for pair in pool.map(lambda t: compare(read[0].events, t.events, chosen.best), read[1:]):
+            found.append(pair)
+            progress("compare", len(found), len(read) - 1)
     notes = _notes(read, found)
     tell(notes, notify)
     contents = comparison_document(read[0].name, [t.name for t in read[1:]], found, notes)
@@ -166,10 +158,7 @@ def compare_tables(
         "comparison.csv": in_table(comparison_rows(contents)),
         "comparison.json": ("species_comparison", contents),
     }
-    write_answer(
-        folder, COMPARISON_FILES, files,
-        lambda: comparison_figure(jsonable(contents), _histograms(read)), overwrite=overwrite,
-    )  # fmt: skip
+    folder.write(files, lambda: comparison_figure(jsonable(contents), _histograms(read)))
     return found
 
 
@@ -187,20 +176,12 @@ def comparison_document(
 
 def comparison_rows(contents: dict[str, Any]) -> pd.DataFrame:
     """Lay out a document ``species_comparison`` as a table."""
-    return pd.DataFrame(
-        [
-            {
-                "source": one["source"],
-                **{
-                    f"p_{key}": one[key]["p_value"]
-                    for key in ("same", "same_masses", "same_fractions")
-                },
-                **row,
-            }
-            for one in contents["comparisons"]
-            for row in one["species"]
-        ]
-    )
+    rows = []
+    for one in contents["comparisons"]:
+        tests = ("same", "same_masses", "same_fractions")
+        head = {"source": one["source"], **{f"p_{key}": one[key]["p_value"] for key in tests}}
+        rows += [head | row for row in one["species"]]
+    return pd.DataFrame(rows)
 
 
 def _pooled(tables: Sequence[EventTable]) -> Events:

@@ -15,13 +15,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.special import betaincinv
+from scipy.stats import binomtest
 
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import choice_in, number_in
 from iscat_analysis.records import BoolArray, FloatArray, is_event
 from iscat_analysis.species.describe import Branch, poisson_interval, round_width
-from iscat_analysis.species.maximum import ENDS_95
 from iscat_analysis.species.tables import EventTable, event_table
 
 MOST_BARS = 2000
@@ -90,11 +89,9 @@ def counted_events(folder: Path, rows: pd.DataFrame) -> EventTable:
     What was missed and what the calibration leaves open are of the whole result, as `find_species`
     takes them from its folder, whichever of its events count.
     """
-    whole = event_table(folder)
-    return replace(
-        event_table(rows, name=folder.name), efficiency=whole.efficiency,
-        edge_kda=whole.edge_kda, scale_error=whole.scale_error, window_frames=whole.window_frames,
-    )  # fmt: skip
+    whole, counted = event_table(folder), event_table(rows, name=folder.name)
+    kept = ("efficiency", "edge_kda", "scale_error", "window_frames")
+    return replace(counted, **{name: getattr(whole, name) for name in kept})
 
 
 def usual_bin(table: pd.DataFrame) -> float:
@@ -150,6 +147,7 @@ def gate(masses_kda: FloatArray, low_kda: float, high_kda: float) -> Gate:
     k, n = inside.size, mass.size
     width = float(np.std(inside, ddof=1)) if k > 1 else math.nan
     least, most = poisson_interval(k)
+    share = binomtest(k, n).proportion_ci() if n else (math.nan, math.nan)
     return Gate(
         low_kda=float(low),
         high_kda=float(high),
@@ -160,18 +158,9 @@ def gate(masses_kda: FloatArray, low_kda: float, high_kda: float) -> Gate:
         mean_se=width / math.sqrt(k) if k > 1 else math.nan,
         width_kda=width,
         fraction=k / n if n else math.nan,
-        fraction_low=_share(k, n, ENDS_95[0], k, n - k + 1) if n else math.nan,
-        fraction_high=_share(k, n, ENDS_95[1], k + 1, n - k) if n else math.nan,
+        fraction_low=float(share[0]),
+        fraction_high=float(share[1]),
     )
-
-
-def _share(k: int, n: int, end: float, first: int, second: int) -> float:
-    """Give one end of the interval of k in n; at the edges it is the edge."""
-    if k == 0 and end < 0.5:
-        return 0.0
-    if k == n and end > 0.5:
-        return 1.0
-    return float(betaincinv(first, second, end))
 
 
 def gate_rows(gates: Collection[Gate]) -> list[dict[str, Any]]:

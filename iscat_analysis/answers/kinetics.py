@@ -32,7 +32,7 @@ import numpy as np
 import pandas as pd
 import scipy
 from numpy.typing import NDArray
-from scipy.special import chdtrc, kolmogorov
+from scipy.special import chdtrc, exprel, kolmogorov
 
 from iscat_analysis.calibration.line import Line
 from iscat_analysis.errors import ConfigError, DataError
@@ -53,7 +53,6 @@ LEAST_LANDINGS = 10
 _LARGEST_RATE_TIME = 200.0  # of kT
 _GRID = 400  # rates among which the maximum is looked for
 _RATE_TOLERANCE = 1e-7  # of its logarithm
-_SMALL = 1e-6  # of kT, below which series take over
 _MASS_SIGMAS = 4.0  # standard errors between the masses of a pair
 
 
@@ -97,7 +96,7 @@ def landing_rate(times_s: FloatArray, seconds: float) -> LandingRate:
     mean = float(share.mean())
 
     def height(x: float) -> float:
-        return n * (_log_slope(x) - x * mean)
+        return -n * (math.log(exprel(-x)) + x * mean)
 
     def rise(x: float) -> float:
         return _middle(x) - mean
@@ -112,8 +111,8 @@ def landing_rate(times_s: FloatArray, seconds: float) -> LandingRate:
     slope = -_middle(best)
     curvature = (_middle(best + 1e-4) - _middle(best - 1e-4)) / -2e-4
     error = math.sqrt((1 + slope**2 / curvature) / n)
-    rate = n / seconds * math.exp(_log_slope(best))
-    law = -np.expm1(-best * share) / -math.expm1(-best) if abs(best) > _SMALL else share
+    rate = n / seconds / exprel(-best)
+    law = share * exprel(-best * share) / exprel(-best)
     steps = np.arange(n + 1) / n
     distance = float(max(np.max(steps[1:] - law), np.max(law - steps[:-1])))
     return LandingRate(
@@ -187,25 +186,14 @@ def unbinding_rate(
         grid = np.linspace(low, high, _GRID)
         near = int(np.argmax([height(x) for x in grid]))
         around = float(grid[max(near - 1, 0)]), float(grid[min(near + 1, grid.size - 1)])
-        best = float(
-            scipy.optimize.minimize_scalar(
-                lambda x: -height(x),
-                bounds=around,
-                method="bounded",
-                options={"xatol": _RATE_TOLERANCE},
-            ).x
-        )
+        search = {"bounds": around, "method": "bounded", "options": {"xatol": _RATE_TOLERANCE}}
+        best = float(scipy.optimize.minimize_scalar(lambda x: -height(x), **search).x)
     top = height(best)
     ends = interval(lambda x: 2 * (top - height(x)), best, low, high, step=1.0)
     rate, least, most = (math.exp(x) for x in (best, *ends))
     if not number:
         rate = least = 0.0
     return UnbindingRate(stay_s.size, number, chance_pairs, rate, least, most)
-
-
-def _log_slope(x: float) -> float:
-    """ln(x/(1 − e^(−x)))."""
-    return x / 2 if abs(x) < _SMALL else math.log(x / -math.expm1(-x))
 
 
 def _middle(x: float) -> float:
@@ -258,14 +246,12 @@ class Kinetics:
         dict
             Nested.
         """
-        unbinding = None if self.unbinding is None else vars(self.unbinding)
-        return {
+        rates = {
             "landing": vars(self.landing),
-            "unbinding": unbinding,
-            "frame_rate_hz": self.frame_rate_hz,
-            "frames": self.frames,
-            "notes": self.notes,
+            "unbinding": self.unbinding and vars(self.unbinding),
         }
+        times = {"frame_rate_hz": self.frame_rate_hz, "frames": self.frames}
+        return {**rates, **times, "notes": self.notes}
 
 
 def fit_kinetics(
@@ -346,12 +332,8 @@ def fit_kinetics(
     findings = []
     searched = table.efficiency.searched if table.efficiency else 1.0
     if searched < 1:
-        landing = replace(
-            landing,
-            per_second=landing.per_second / searched,
-            per_second_low=landing.per_second_low / searched,
-            per_second_high=landing.per_second_high / searched,
-        )
+        kept = ("per_second", "per_second_low", "per_second_high")
+        landing = replace(landing, **{name: getattr(landing, name) / searched for name in kept})
     if searched < _SEARCHED:
         findings.append(PARTLY_SEARCHED({"share": searched}))
     unbinding = _unbinding(table, inside, stop, frame_rate_hz, radius_px)
@@ -406,12 +388,6 @@ def _unbinding(
     known = (mass > 0) & (censor > window) & ~(stay <= window)
     if not known.any():
         return None
-    detected = np.ones(mass.size)
-    if table.efficiency is not None:
-        detected = table.efficiency(np.abs(mass))
-    return unbinding_rate(
-        (stay[known] - window) / rate_hz,
-        (censor[known] - window) / rate_hz,
-        detected[known],
-        chance_pairs=chance,
-    )
+    detected = np.ones(mass.size) if table.efficiency is None else table.efficiency(np.abs(mass))
+    stays, censored = ((times[known] - window) / rate_hz for times in (stay, censor))
+    return unbinding_rate(stays, censored, detected[known], chance_pairs=chance)

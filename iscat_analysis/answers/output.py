@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 import pandas as pd
@@ -12,6 +13,7 @@ import tifffile
 from matplotlib.figure import Figure
 
 from iscat_analysis.inference.checks import path_in
+from iscat_analysis.records import Progress, silent
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.style import publish
 from iscat_analysis.report.tables import CSV_DIGITS
@@ -20,43 +22,60 @@ from iscat_analysis.schemas import to_json
 Notify = Callable[[str], None]
 
 
-def folder_for(out: str | Path | None, known: frozenset[str], *, overwrite: bool) -> Path | None:
-    """Check the folder of an answer before the work begins; None where nothing is written."""
-    folder = None if out is None else path_in("`out`", out)
-    if folder is not None:
-        check_output(folder, overwrite, known=known)
+class Writing(TypedDict, total=False):
+    """How an answer is written, and who is told."""
+
+    overwrite: bool
+    progress: Progress
+    notify: Notify | None
+
+
+@dataclass(frozen=True)
+class AnswerFolder:
+    """The folder of an answer, where one is wanted, and the names of all that may be in it."""
+
+    path: Path | None
+    known: frozenset[str]
+    overwrite: bool = False
+    progress: Progress = silent
+    notify: Notify | None = None
+
+    def write(
+        self,
+        files: Mapping[str, Any],
+        figures: Callable[[], Iterable[tuple[str, Figure]]] | None = None,
+    ) -> None:
+        """Write all files of an answer, or none.
+
+        A table becomes CSV, an array TIFF, a document with the name of its schema JSON; text and
+        bytes stay as they are, and what is None is left out.
+        """
+        if self.path is None:
+            return
+        with atomic_folder(self.path, self.overwrite, known=self.known) as building:
+            for name, content in files.items():
+                path = building / name
+                if isinstance(content, pd.DataFrame):
+                    content.to_csv(path, index=False, float_format=f"%.{CSV_DIGITS}g")
+                elif isinstance(content, np.ndarray):
+                    tifffile.imwrite(path, content)
+                elif isinstance(content, tuple):
+                    path.write_text(to_json(*content) + "\n", encoding="utf-8")
+                elif content is not None:
+                    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+            if figures is not None:
+                (building / "figures").mkdir()
+                publish(figures(), building / "figures")
+
+
+def folder_for(out: str | Path | None, *known: str, **writing: Unpack[Writing]) -> AnswerFolder:
+    """Check the folder of an answer before the work begins."""
+    folder = AnswerFolder(
+        None if out is None else path_in("`out`", out), frozenset(known), **writing
+    )
+    if folder.path is not None:
+        check_output(folder.path, folder.overwrite, known=folder.known)
     return folder
-
-
-def write_answer(
-    folder: Path | None,
-    known: frozenset[str],
-    files: Mapping[str, Any],
-    figures: Callable[[], Iterable[tuple[str, Figure]]] | None = None,
-    *,
-    overwrite: bool,
-) -> None:
-    """Write all files of an answer, or none.
-
-    A table becomes CSV, an array TIFF, a document with the name of its schema JSON; text and bytes
-    stay as they are, and what is None is left out.
-    """
-    if folder is None:
-        return
-    with atomic_folder(folder, overwrite, known=known) as building:
-        for name, content in files.items():
-            path = building / name
-            if isinstance(content, pd.DataFrame):
-                content.to_csv(path, index=False, float_format=f"%.{CSV_DIGITS}g")
-            elif isinstance(content, np.ndarray):
-                tifffile.imwrite(path, content)
-            elif isinstance(content, tuple):
-                path.write_text(to_json(*content) + "\n", encoding="utf-8")
-            elif content is not None:
-                path.write_bytes(content if isinstance(content, bytes) else content.encode())
-        if figures is not None:
-            (building / "figures").mkdir()
-            publish(figures(), building / "figures")
 
 
 def tell(notes: Iterable[str], notify: Notify | None) -> None:

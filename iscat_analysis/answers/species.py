@@ -11,28 +11,16 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.answers.kinetics import Kinetics
-from iscat_analysis.answers.output import Notify, folder_for, tell, write_answer
+from iscat_analysis.answers.output import Notify, folder_for, tell
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import choice_in, number_in, shown, truth_in
 from iscat_analysis.options import EventOptions, SpeciesOptions, only, takes
 from iscat_analysis.report.species import species_figure
 from iscat_analysis.report.style import drawn
 from iscat_analysis.schemas import jsonable
-from iscat_analysis.species import LEAST_EVENTS, Distribution, describe
-from iscat_analysis.species.choices import (
-    MOST_RUNGS,
-    Begun,
-    Choice,
-    Given,
-    Ladder,
-    Number,
-    Searched,
-)
+from iscat_analysis.species import LEAST_EVENTS, Distribution, choices, describe
 from iscat_analysis.species.tables import EventTable, event_table, mass_in, refuse_far, sentences
 from iscat_analysis.units import count
-
-SPECIES_FILES = frozenset({"species.csv", "species.json", "figures"})
-"""Everything `find_species` may leave in its folder."""
 
 _EVENTS_EACH = 5  # of a species
 _MOST_SPECIES = 1000
@@ -102,7 +90,7 @@ def find_species(
         raise ConfigError(f"`kinetics` = {shown(kinetics)}: give what `fit_kinetics` returns")
     branch = options["branch"]
     choice_in("`branch`", branch, ("magnitude", "landing", "leaving"))
-    folder = folder_for(out, SPECIES_FILES, overwrite=overwrite)
+    folder = folder_for(out, "species.csv", "species.json", "figures", overwrite=overwrite)
     table = event_table(events, **only(EventOptions, options))
     _refuse_impossible(table, choice)
     found = describe(
@@ -131,39 +119,41 @@ def find_species(
         contents["kinetics"] = kinetics.to_dict()
     files = {"species.csv": found.species, "species.json": ("species", contents)}
     sketch = ("species", partial(species_figure, jsonable(contents)))
-    write_answer(folder, SPECIES_FILES, files, lambda: drawn([sketch]), overwrite=overwrite)
+    folder.write(files, lambda: drawn([sketch]))
     return found
 
 
-def _refuse_impossible(table: EventTable, choice: Choice) -> None:
+def _refuse_impossible(table: EventTable, choice: choices.Choice) -> None:
     """Refuse more species than events can tell, and masses without an event near them."""
-    number, fewer = (choice.k, "a smaller `k`") if isinstance(choice, Number) else (0, "")
-    if isinstance(choice, Begun):
+    number, fewer = 0, ""
+    if isinstance(choice, choices.Number):
+        number, fewer = choice.k, "a smaller `k`"
+    elif isinstance(choice, choices.Begun):
         number, fewer = len(choice.masses_kda), "fewer in `start_kda`"
     if table.mass_kda.size < _EVENTS_EACH * number:
         raise DataError(
             f"{table.name}: holds {count(table.mass_kda.size, 'event')}, too few for {number} "
             f"species, which need {_EVENTS_EACH} each; give {fewer}"
         )
-    if isinstance(choice, (Begun, Given)):
-        argument = "`masses_kda`" if isinstance(choice, Given) else "`start_kda`"
+    if isinstance(choice, (choices.Begun, choices.Given)):
+        argument = "`masses_kda`" if isinstance(choice, choices.Given) else "`start_kda`"
         refuse_far([table], choice.masses_kda, argument)
-    elif isinstance(choice, Ladder) and choice.monomer_kda is not None:
+    elif isinstance(choice, choices.Ladder) and choice.monomer_kda is not None:
         monomer = choice.monomer_kda
-        rungs = [n * monomer for n in choice.steps or (1, MOST_RUNGS)]
+        rungs = [n * monomer for n in choice.steps or (1, choices.MOST_RUNGS)]
         refuse_far([table], rungs, f"`ladder` = {monomer:.4g}")
 
 
-def choice_of(options: SpeciesOptions) -> Choice:
+def choice_of(options: SpeciesOptions) -> choices.Choice:
     """Say which species to look for, and refuse what is impossible."""
-    k, ladder, steps = options["k"], options["ladder"], options["steps"]
-    masses_kda, start_kda = options["masses_kda"], options["start_kda"]
-    given = {"k": k, "masses_kda": masses_kda, "start_kda": start_kda, "ladder": ladder}
-    named = [name for name, value in given.items() if value is not None]
+    ways = ("k", "masses_kda", "start_kda", "ladder")
+    named = [name for name in ways if options.get(name) is not None]
     if len(named) > 1:
         raise ConfigError(
             f"`{named[0]}` and `{named[1]}` are two descriptions of the species; give one of them"
         )
+    k, ladder, steps = options["k"], options["ladder"], options["steps"]
+    masses_kda, start_kda = options["masses_kda"], options["start_kda"]
     offset, hold, background = options["offset"], options["hold"], options["background"]
     for name, value in (("offset", offset), ("hold", hold), ("background", background)):
         truth_in(f"`{name}`", value)
@@ -176,13 +166,13 @@ def choice_of(options: SpeciesOptions) -> Choice:
         which = "steps" if len(steps) else "offset" if offset else "hold"
         raise ConfigError(f"`{which}` is of a ladder; give `ladder` as well")
     if k is not None:
-        return Number(int(number_in("`k`", k, least=1, most=_MOST_SPECIES, whole=True)))
+        return choices.Number(int(number_in("`k`", k, least=1, most=_MOST_SPECIES, whole=True)))
     if start_kda is not None:
-        return Begun(_masses("`start_kda`", start_kda))
+        return choices.Begun(_masses("`start_kda`", start_kda))
     if masses_kda is not None:
-        return Given(_masses("`masses_kda`", masses_kda), widths, background)
+        return choices.Given(_masses("`masses_kda`", masses_kda), widths, background)
     if ladder is None:
-        return Searched()
+        return choices.Searched()
     rungs = [int(number_in("`steps`", n, least=1, most=1e6, whole=True)) for n in steps]
     if len(set(rungs)) < len(rungs):
         raise ConfigError("`steps`: must be different numbers of monomers, 1 or more, as in 1,2,4")
@@ -190,9 +180,9 @@ def choice_of(options: SpeciesOptions) -> Choice:
         if hold or rungs:
             which = "hold" if hold else "steps"
             raise ConfigError(f"`{which}` needs a monomer whose mass is given, as in `ladder` = 66")
-        return Ladder(None, (), offset, widths=widths, background=background)
+        return choices.Ladder(None, (), offset, widths=widths, background=background)
     monomer = mass_in("`ladder`", ladder, "mass of a monomer in kDa")
-    return Ladder(monomer, tuple(rungs), offset, hold, widths, background)
+    return choices.Ladder(monomer, tuple(rungs), offset, hold, widths, background)
 
 
 def _masses(name: str, given: Sequence[float]) -> tuple[float, ...]:

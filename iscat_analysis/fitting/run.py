@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from iscat_analysis import _kernels
 from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, config_to_toml
-from iscat_analysis.executors import Executor, LocalExecutor
+from iscat_analysis.executors import Executor
 from iscat_analysis.files import whole_file
 from iscat_analysis.findings import Finding, Findings, existing
 from iscat_analysis.fitting.context import AnalysisContext
@@ -266,7 +266,7 @@ class Run:
     notify: Notify = notify_nobody
     progress: Progress = silent
     partial: Path | None = None
-    executor: Executor = field(default_factory=LocalExecutor)
+    executor: Executor = field(default_factory=Executor)
     inject: int = 0
     clock: Clock = field(default_factory=Clock)
     findings: Findings = field(default_factory=Findings)

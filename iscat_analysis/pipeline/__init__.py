@@ -30,7 +30,7 @@ from iscat_analysis.diagnosis import (
     look_at_changes,
 )
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.executors import Executor, LocalExecutor
+from iscat_analysis.executors import Executor
 from iscat_analysis.findings import Finding, existing
 from iscat_analysis.fitting.ranges import tracked_frames
 from iscat_analysis.fitting.run import (
@@ -159,7 +159,7 @@ def analyse(
     refuse_rod(config, "iscat-fit does not fit directions")
     started = datetime.now(UTC).isoformat(timespec="seconds")
     with compiling(notify):
-        run = Run(notify, progress, partial, executor or LocalExecutor(), inject)
+        run = Run(notify, progress, partial, executor or Executor(), inject)
         kind = kind_of(config)
         ready = prepare(movie, config, run)  # load, calibrate
         if kind.inject is None:
