@@ -62,16 +62,7 @@ class Floaters:
 class Volume:
     """Pictures of spheres at all heights, as spectra that paths are summed in.
 
-    Parameters
-    ----------
-    field_px : (int, int)
-        Rows and columns.
-    ceiling_nm : float
-        Highest place of a particle [nm].
-    instrument : Instrument, optional
-        Through which they are seen; the default conserves energy.
-    pixel_nm : float
-        Side of a pixel [nm].
+    `field_px` is (rows, columns); the default instrument conserves energy.
     """
 
     def __init__(
@@ -131,26 +122,8 @@ class Volume:
     ) -> Floaters:
         """Record spheres that diffuse between walls which reflect.
 
-        Parameters
-        ----------
-        frames : int
-            How many.
-        spheres : tuple of Sphere
-            Which.
-        seed : int
-            Of everything.
-        level_e, speckle, power_noise : float
-            Photoelectrons per pixel and frame, their relative spread from pixel to pixel, and from
-            frame to frame.
-        frame_rate_hz, exposure_ms, gain_e_per_adu : float
-            Of the camera.
-        spread_nm : float
-            How far from the middle of the field particles may begin, along x and y.
-
-        Returns
-        -------
-        Floaters
-            The movie.
+        `speckle` and `power_noise` are the relative spread of the light from pixel to pixel and
+        frame to frame; particles begin within `spread_nm` of the middle of the field.
         """
         rng = np.random.default_rng(seed)
         kinds = [sphere for sphere in spheres for _ in range(sphere.count)]

@@ -74,16 +74,9 @@ def _bessel(argument: bytes, shape: tuple[int, int]) -> FloatArray:
 
 
 class Pictures:
-    """Contrast of a particle through one microscope.
+    """Contrast of a particle through one microscope, as far as `reach_nm` from it.
 
-    Parameters
-    ----------
-    instrument : Instrument
-        The microscope.
-    reach_nm : float
-        Distance from the particle to the farthest pixel.
-    pixel_nm : float
-        Side of the pixels, over which light is averaged; 0 for the light at a point.
+    Light is averaged over pixels; where `pixel_nm` is 0 it is that at a point.
     """
 
     def __init__(
@@ -286,28 +279,12 @@ class Landings:
 class InstrumentMovie:
     """A landing movie in memory, with Poisson noise.
 
-    Parameters
-    ----------
-    instrument : Instrument
-        Through which it is seen.
-    shape : (int, int, int)
-        Frames, rows, columns.
-    landings : Landings
-        What lands.
-    seed : int
-        Of the noise and the background.
-    level_e : float
-        Photoelectrons per pixel and frame.
-    pixel_nm, gain_e_per_adu : float
-        Of the camera.
-    focus_nm : ndarray, shape (frames,), optional
-        Rise of the focus in every frame; the masses are those of the instrument's own focus.
-    speckle : float
-        Standard deviation of the background.
-    beam : ndarray, shape (rows, columns), or float
-        Light that falls on the sample, which stays where it is.
-    stage_px : ndarray, shape (frames, 2), optional
-        Where the sample is along y and x in every frame.
+    Shapes: `shape` is (frames, rows, columns), `focus_nm` (frames,), `beam` (rows, columns),
+    `stage_px` (frames, 2) along y and x.
+
+    `focus_nm` is its rise in every frame, and masses are those of the instrument's own focus;
+    `speckle` is the standard deviation of the background, and `beam` the light that falls on the
+    sample, which stays where it is while the stage moves.
     """
 
     name = "movie"

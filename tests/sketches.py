@@ -31,23 +31,9 @@ def sketch(
     printed: bool = False,
     pause_s: float = 0.0,
 ) -> dict[str, Markup]:
-    """Take the place of `publish`: files of a kilobyte stand for the figures.
+    """Take the place of `publish`: files of a kilobyte stand for the figures, SVG without content.
 
-    Parameters
-    ----------
-    figures : iterable of (str, Figure)
-        As `publish` is given them; a generator draws each.
-    folder : Path, optional
-        Where the files go.
-    printed : bool
-        Makes no difference here.
-    pause_s : float
-        A moment after each file, in which a process can be killed.
-
-    Returns
-    -------
-    dict of str to Markup
-        An empty SVG element for each.
+    After each file there is a pause, in which a process can be killed.
     """
     del printed
     names = [name for name, _ in figures]

@@ -83,38 +83,14 @@ def wander(
 ) -> Wanderers:
     """Record particles that diffuse during the whole of every frame.
 
-    Parameters
-    ----------
-    shape : (int, int, int)
-        Frames, rows, columns.
-    seed : int
-        Of everything.
-    instrument : Instrument, optional
-        Through which they are seen; the default conserves energy.
-    species : tuple of (float, float, int)
-        As in `SPECIES`.
-    level_e, speckle, power_noise : float
-        Photoelectrons per pixel and frame, their relative spread from pixel to pixel, and from
-        frame to frame.
-    frame_rate_hz, pixel_nm, gain_e_per_adu : float
-        Of the camera.
-    drift_nm_per_frame : (float, float)
-        Velocity of the pattern of the light along x and y; what leaves the field on one side enters
-        it on the other.
-    stage_nm : ndarray, shape (frames, 2), optional
-        Where the stage is in every frame, along x and y: particles and the pattern of the light
-        move with it, and the truth holds what the camera sees.
-    led : callable, optional
-        Takes the places x, y of every particle in every part of a frame, shape (particles, frames,
-        parts, 2) [nm], and gives others.
-    shade : callable, optional
-        Takes the number of a frame and gives what the illumination multiplies the light by, shape
-        (rows, columns) or one that is broadcast to it.
+    Shapes: `shape` is (frames, rows, columns), `stage_nm` (frames, 2).
 
-    Returns
-    -------
-    Wanderers
-        The movie.
+    The default instrument conserves energy, and `species` are as in `SPECIES`.  `speckle` and
+    `power_noise` are the relative spread of the light from pixel to pixel and frame to frame.  What
+    drifts out of the field on one side enters it on the other.  Particles and the pattern of the
+    light move with the stage, and the truth holds what the camera sees.  `led` takes the places of
+    every particle in every part of a frame (particles, frames, parts, 2) [nm] and gives others;
+    `shade` takes the number of a frame and gives what multiplies its light (rows, columns).
     """
     rng = np.random.default_rng(seed)
     frames, rows, columns = shape

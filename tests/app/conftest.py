@@ -20,6 +20,9 @@ from small_movies import LANDING
 
 import iscat_analysis as ia
 
+OWN = ("data:", "blob:", "chrome:", "chrome-untrusted:")
+"""Addresses within a browser, some of which it opens by itself."""
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -90,6 +93,6 @@ def page(driver: Any, address: str) -> Iterator[Page]:
         if message["method"] == "Network.requestWillBeSent":
             asked.add(message["params"]["request"]["url"])
     here = address.partition("?")[0]
-    assert [url for url in asked if not url.startswith((here, "data:", "blob:", "chrome:"))] == []
+    assert [url for url in asked if not url.startswith((here, *OWN))] == []
     failed = [entry for entry in driver.get_log("browser") if entry["level"] == "SEVERE"]
     assert [entry["message"] for entry in failed] == []

@@ -19,7 +19,7 @@ from iscat_analysis.report.answer import answer_in
 pytest.importorskip("panel", reason="needs the Python package panel")
 
 from iscat_app.calibrate import Calibrate
-from iscat_app.chosen import Chosen, table_of
+from iscat_app.chosen import Chosen
 from iscat_app.compare import Compare
 from iscat_app.export import Export
 from iscat_app.files import Files, listed, result_facts
@@ -27,6 +27,7 @@ from iscat_app.form import FIRST, Form, fields
 from iscat_app.results import Rejections, Results
 from iscat_app.runs import Job, Queue
 from iscat_app.settings import add_table, beside, read_texts, take, write_texts
+from iscat_app.widgets import table_of
 from iscat_cli import main
 
 
@@ -74,7 +75,7 @@ def test_saving_keeps_what_the_form_does_not_show(tmp_path: Path, sample_configs
     chosen.choose(tmp_path / "movie.tif")
     form = Form(chosen)
     form.refresh()
-    form._save(None)
+    form._save()
     assert ia.load_config(path) == before
 
 
@@ -119,7 +120,7 @@ def test_frames_that_are_left_out_add_up_in_the_form(tmp_path: Path) -> None:
     form.refresh()
     chosen.excluded = (20, 40)
     form.refresh()
-    form._save(None)
+    form._save()
     assert ia.load_config(tmp_path / "iscat.toml").fit.excluded_frames == ((5, 9), (20, 40))
 
 
@@ -201,7 +202,7 @@ def test_the_command_that_is_exported_finds_the_species_of_the_window(
     words = shlex.split(line)[1:]
     if rejects:
         words[1] = str(tmp_path / "standards.csv")
-        Path(words[1]).write_bytes(export._csv().getvalue())
+        Path(words[1]).write_bytes(export._csv())
     assert main([*words, "--draws", "0", "--json"]) == 0
     outside = pd.DataFrame(json.loads(capsys.readouterr().out)["species"])
     for column in ("mass_kda", "count", "fraction", "efficiency"):

@@ -5,23 +5,31 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pandas as pd
 import pytest
 
 from iscat_analysis.bounds import paper
 from iscat_analysis.report.bounds import PAPER_FILES
+from iscat_analysis.schemas import schema
 from iscat_cli import main
 
 SETUP = {"camera.pixel_size_nm": "84.4", "bounds.pixels": "25"}
 
 
+def words(setup: dict[str, str] = SETUP) -> list[str]:
+    return [word for item in setup.items() for word in ("--set", "=".join(item))]
+
+
 def run(
     capsys: pytest.CaptureFixture[str], *arguments: str, setup: dict[str, str] = SETUP
 ) -> tuple[int, str, str]:
-    setup_words = [word for item in setup.items() for word in ("--set", "=".join(item))]
-    status = main(["bounds", *setup_words, *arguments])
+    status = main(["bounds", *words(setup), *arguments])
     said = capsys.readouterr()
+    if "--json" in arguments:
+        report = json.loads(said.out, parse_constant=pytest.fail)
+        jsonschema.Draft202012Validator(schema("bounds")).validate(report)
     return status, said.out, said.err
 
 
@@ -118,14 +126,8 @@ def test_pupil(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
         (["--target", "mass=none"], "mass=5kDa"),
     ],
 )
-def test_bad_input_gets_one_line(
-    capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
-    status, out, err = run(capsys, *arguments)
-    assert status == 2
-    assert out == ""
-    assert message in err
-    assert len(err.strip().splitlines()) == 1
+def test_bad_input_gets_one_line(only_line, arguments: list[str], message: str) -> None:
+    assert message in only_line("bounds", *words(), *arguments)
 
 
 def test_unidentifiable_directions_are_named(capsys: pytest.CaptureFixture[str]) -> None:

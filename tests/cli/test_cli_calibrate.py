@@ -6,7 +6,9 @@ import json
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
+import jsonschema
 import numpy as np
 import pandas as pd
 import pytest
@@ -14,6 +16,7 @@ import tifffile
 
 from iscat_analysis.config import load_config
 from iscat_analysis.records import EVENT_COLUMNS
+from iscat_analysis.schemas import schema
 from iscat_cli import main
 
 Captured = pytest.CaptureFixture[str]
@@ -52,6 +55,16 @@ def fits_table(folder: Path, *, sign: float = -1.0) -> Path:
     return path
 
 
+def checked(name: str, printed: str, folder: Path) -> dict[str, Any]:
+    """Read what was printed; it and the file in the folder follow the schema, and fill it."""
+    found = json.loads(printed, parse_constant=pytest.fail)
+    written = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+    for document in (found, written):
+        jsonschema.Draft202012Validator(schema(name)).validate(document)
+    assert set(found) | set(written) == set(schema(name)["properties"])
+    return dict(found)
+
+
 def test_camera_from_a_movie_and_a_dark(recordings: Path, tmp_path: Path, capsys: Captured) -> None:
     out = tmp_path / "camera"
     movie, dark = str(recordings / "movie.tif"), str(recordings / "dark.tif")
@@ -60,8 +73,10 @@ def test_camera_from_a_movie_and_a_dark(recordings: Path, tmp_path: Path, capsys
     )
     said = capsys.readouterr()
     assert status == 0, said.err
-    found = json.loads(said.out)
+    found = checked("camera", said.out, out)
     assert found["out"] == str(out)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(found | {"gain_e_per_adu": {"value": 1.0}}, schema("camera"))
     for key, truth in (
         ("gain_e_per_adu", 2.0),
         ("offset_adu", 200.0),
@@ -90,6 +105,8 @@ def test_camera_prints_a_table_and_a_verdict(
     arguments = ["calibrate", "camera", movie, "--offset", "200", "--out", str(tmp_path / "c")]
     assert main(arguments) == 0
     said = capsys.readouterr()
+    contents = json.loads((tmp_path / "c" / "camera.json").read_text(encoding="utf-8"))
+    jsonschema.validate(contents, schema("camera"))
     assert re.search(r"gain \[e/count\] +(1\.9|2\.0)", said.out)
     assert re.search(r"offset \[counts\] +200 +given +given", said.out)
     assert "shot-noise limited up to" in said.out
@@ -99,33 +116,30 @@ def test_camera_prints_a_table_and_a_verdict(
     assert capsys.readouterr().err == ""
 
 
-def test_camera_mistakes_are_one_line_each(
-    recordings: Path, tmp_path: Path, capsys: Captured
-) -> None:
-    dark = str(recordings / "dark.tif")
+def test_camera_mistakes_are_one_line_each(recordings: Path, tmp_path: Path, only_line) -> None:
+    dark, out = str(recordings / "dark.tif"), tmp_path / "x"
     for arguments, status, message in (
         ([], 2, "give a flat, the movie, or --dark"),
         (["--dark", dark, "--offset", "3"], 2, "leave --offset out"),
         ([str(tmp_path / "none.tif")], 1, "no such file"),
         ([dark, "--dark", dark], 1, "no darker than"),
     ):
-        given = ["calibrate", "camera", *arguments, "--out", str(tmp_path / "x"), "--quiet"]
-        assert main(given) == status
-        said = capsys.readouterr()
-        assert message in said.err
-        assert said.err.count("\n") == 1
-        assert not (tmp_path / "x").exists()
+        given = ["calibrate", "camera", *arguments, "--out", str(out), "--quiet"]
+        assert message in only_line(*given, status=status)
+        assert not out.exists()
 
 
 def test_mass_from_the_packages_own_table(tmp_path: Path, capsys: Captured) -> None:
     path = fits_table(tmp_path)
     arguments = ["calibrate", "mass", str(path), "--standards", "480,66,146"]
     assert main([*arguments, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
+    out = tmp_path / "fits.calibration"
+    found = checked("calibration", capsys.readouterr().out, out)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(found | {"landing": "grey"}, schema("calibration"))
     assert abs(found["gradient_per_kda"] + 3.1e-5) < 4 * found["gradient_se"]
     assert found["landing"] == "dark"
     assert found["events"] == 192
-    out = tmp_path / "fits.calibration"
     assert sorted(p.name for p in out.iterdir()) == [
         ".iscat-files", "calibration.html", "calibration.json", "calibration.toml",
     ]  # fmt: skip
@@ -149,8 +163,8 @@ def test_a_bright_table_says_so_itself(tmp_path: Path, capsys: Captured) -> None
     assert "the contrast has the wrong sign" in capsys.readouterr().err
 
 
-def test_mass_mistakes_are_one_line_each(tmp_path: Path, capsys: Captured) -> None:
-    path = str(fits_table(tmp_path))
+def test_mass_mistakes_are_one_line_each(tmp_path: Path, only_line) -> None:
+    path, out = str(fits_table(tmp_path)), tmp_path / "x"
     empty = tmp_path / "empty.csv"
     empty.write_text(",".join(EVENT_COLUMNS) + "\n")
     for events, standards, status, message in (
@@ -161,11 +175,8 @@ def test_mass_mistakes_are_one_line_each(tmp_path: Path, capsys: Captured) -> No
         (str(tmp_path / "none.csv"), "66,146", 1, "cannot be read"),
     ):
         given = ["calibrate", "mass", events, "--standards", standards, "--quiet"]
-        assert main([*given, "--out", str(tmp_path / "x")]) == status
-        said = capsys.readouterr()
-        assert message in said.err
-        assert said.err.count("\n") == 1
-        assert not (tmp_path / "x").exists()
+        assert message in only_line(*given, "--out", str(out), status=status)
+        assert not out.exists()
 
 
 def test_refeyns_table_through_the_command(

@@ -60,19 +60,14 @@ def test_a_blind_challenge_from_making_to_the_page(
     assert (tmp_path / "scores.zip").stat().st_size > 1000
 
 
-def test_what_cannot_be_scored_is_said(
-    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    capsys.readouterr()
-    assert main(["challenge", "score", str(made)]) == 2
-    assert "nothing to score" in capsys.readouterr().err
-    assert main(["challenge", "score", str(made), "absent.csv"]) == 1
-    assert "absent.csv" in capsys.readouterr().err
+def test_what_cannot_be_scored_is_said(made: Path, tmp_path: Path, only_line) -> None:
+    score = ("challenge", "score", str(made))
+    assert "nothing to score" in only_line(*score)
+    assert "absent.csv" in only_line(*score, "absent.csv", status=1)
     made.with_name("made.truth.json").unlink()
-    assert main(["challenge", "score", str(made), "absent.csv"]) == 1
-    assert "give it as --truth" in capsys.readouterr().err
-    assert main(["challenge", "make", "--out", str(tmp_path / "x")]) == 2
-    assert "--preset or --config" in capsys.readouterr().err
+    assert "give it as --truth" in only_line(*score, "absent.csv", status=1)
+    line = only_line("challenge", "make", "--out", str(tmp_path / "x"))
+    assert "--preset or --config" in line
 
 
 def test_estimators_that_can_be_named_are_listed(

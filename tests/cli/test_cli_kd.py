@@ -71,12 +71,9 @@ def test_json_follows_the_schema(samples: Path, tmp_path: Path, capsys) -> None:
     ],
 )
 def test_what_is_wrong_is_said_with_the_option(
-    options: str, status: int, said: str, samples: Path, capsys
+    options: str, status: int, said: str, samples: Path, only_line
 ) -> None:
-    assert main(["kd", str(samples), *options.split()]) == status
-    error = capsys.readouterr().err
-    assert said in error
-    assert len(error.splitlines()) == 1
+    assert said in only_line("kd", str(samples), *options.split(), status=status)
 
 
 FORMATS = [

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import json
 import tomllib
+from contextlib import redirect_stdout
 from pathlib import Path
+from typing import Any
 
+import jsonschema
 import numpy as np
 import pandas as pd
 import pytest
 
 from iscat_analysis.config import load_config
 from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, REPEAT_COLUMNS
+from iscat_analysis.schemas import schema
 from iscat_cli import main, main_fit
 
 pytestmark = pytest.mark.usefixtures("all_sketched")
@@ -36,13 +41,24 @@ def movies(tmp_path_factory, sample_configs) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def fitted(movies, sample_configs) -> dict[str, Path]:
-    """Fit each sample once."""
+    """Fit each sample once; what is printed lies in the folder as well."""
     folders = {}
     for mode, movie in movies.items():
         arguments = [str(movie), "--config", str(sample_configs[mode]), "--no-posterior"]
-        assert main_fit([*arguments, "--quiet"]) == 0
+        with redirect_stdout(io.StringIO()) as printed:
+            assert main_fit([*arguments, "--json", "--quiet"]) == 0
         folders[mode] = movie.with_suffix(".iscat")
+        (folders[mode] / "printed.json").write_text(printed.getvalue(), encoding="utf-8")
     return folders
+
+
+def _read(path: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"), parse_constant=pytest.fail)
+    return found
+
+
+def _check(value: Any, name: str) -> None:
+    jsonschema.Draft202012Validator(schema(name)).validate(value)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -77,8 +93,6 @@ def test_bounds_of_the_samples(mode: str, sample_configs, capsys) -> None:
     for name in FREE_PARAMETERS[mode]:
         actual = {kind: bound[name] for kind, bound in report["actual"].items() if name in bound}
         assert 0 < actual["qcrb"] < actual["crb_single"] <= actual["crb_joint"] * (1 + 1e-12)
-    assert main(["bounds", "--config", str(sample_configs[mode])]) == 0
-    assert "per photon" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -106,12 +120,33 @@ def test_fits_meet_the_truth(mode: str, fitted, movies) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_the_folder_is_complete(mode: str, fitted) -> None:
+def test_the_folder_is_complete_and_follows_the_schemas(mode: str, fitted) -> None:
     names = {path.name for path in fitted[mode].iterdir()}
     expected = {"fits.csv", "fits.parquet", "summary.json", "config.toml", "report.html", "figures"}
     assert expected <= names
     assert "posterior.nc" not in names
-    json.loads((fitted[mode] / "summary.json").read_text(), parse_constant=pytest.fail)
+    _check(_read(fitted[mode] / "summary.json"), "summary")
+    printed = _read(fitted[mode] / "printed.json")
+    _check(printed, "fit")
+    _check(printed | {"events": [], "status": {}}, "fit")
+
+
+def test_the_schema_refuses_what_is_wrong(fitted) -> None:
+    """Control: one that accepts everything would pass all of these tests."""
+    for change in (
+        lambda fit: fit.pop("versions"),
+        lambda fit: fit["events"][0].pop("crb_x_nm"),
+        lambda fit: fit["events"][0].update(status="good"),
+        lambda fit: fit["events"][0].update(p_value=1.5),
+        lambda fit: fit["events"][0].update(sigma_x_nm=-1.0),
+        lambda fit: fit["events"][0].update(unknown=1),
+        lambda fit: fit.update(events=1),
+        lambda fit: fit["input"].update(sha256="abc"),
+    ):
+        bad = _read(fitted["mass"] / "printed.json")
+        change(bad)
+        with pytest.raises(jsonschema.ValidationError):
+            _check(bad, "fit")
 
 
 @pytest.mark.large
@@ -126,36 +161,3 @@ def test_the_written_configuration_reruns_the_job(fitted, movies, tmp_path, caps
     first, second = (pd.read_csv(folder / "fits.csv") for folder in (fitted["mass"], again))
     pd.testing.assert_frame_equal(first, second)
     assert [event["x_nm"] for event in result["events"]] == pytest.approx(list(second["x_nm"]))
-
-
-@pytest.mark.usefixtures("fitted")
-def test_results_are_not_overwritten_unasked(movies, sample_configs, capsys) -> None:
-    arguments = [str(movies["mass"]), "--config", str(sample_configs["mass"]), "--no-posterior"]
-    assert main_fit([*arguments, "--quiet"]) in (1, 2)
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    (line,) = captured.err.splitlines()
-    assert "--overwrite" in line
-
-
-@pytest.mark.parametrize("content", [None, b"", b"not a movie", b"II*\0\x08\0\0\0"])
-def test_what_is_no_movie_is_refused_in_one_line(content, tmp_path, capsys) -> None:
-    path = tmp_path / "movie.tif"
-    if content is not None:
-        path.write_bytes(content)
-    assert main_fit([str(path), "--set", "camera.pixel_size_nm=84.4"]) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    (line,) = [line for line in captured.err.splitlines() if ": error: " in line]
-    assert "movie.tif" in line
-    assert "unexpected" not in line
-    assert not path.with_suffix(".iscat").exists()
-
-
-def test_frames_beyond_the_movie_are_refused(movies, sample_configs, tmp_path, capsys) -> None:
-    arguments = [str(movies["mass"]), "--config", str(sample_configs["mass"])]
-    arguments += ["--frames", "200:4000", "--out", str(tmp_path / "out"), "--quiet"]
-    assert main_fit(arguments) in (1, 2)
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "400" in line
-    assert "unexpected" not in line

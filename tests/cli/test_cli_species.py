@@ -68,12 +68,9 @@ def test_json_follows_the_schema(events: Path, tmp_path: Path, capsys) -> None:
     ],
 )
 def test_what_is_wrong_is_said_with_the_option(
-    options: str, status: int, said: str, events: Path, capsys
+    options: str, status: int, said: str, events: Path, only_line
 ) -> None:
-    assert main(["species", str(events), *options.split()]) == status
-    error = capsys.readouterr().err
-    assert said in error
-    assert len(error.splitlines()) == 1
+    assert said in only_line("species", str(events), *options.split(), status=status)
 
 
 def test_notes_name_options(events: Path, tmp_path: Path, capsys) -> None:
@@ -124,9 +121,9 @@ def test_samples_are_compared_with_the_first(events: Path, tmp_path: Path, capsy
 @pytest.mark.parametrize(
     "option", ["--offset", "--hold", "--branch=landing", "--widths=common", "--start=66"]
 )
-def test_what_is_for_one_table_is_refused_for_two(option: str, events: Path, capsys) -> None:
-    assert main(["species", str(events), str(events), "--ladder", "66", option]) == 2
-    assert f"{option.partition('=')[0]} is for a single table" in capsys.readouterr().err
+def test_what_is_for_one_table_is_refused_for_two(option: str, events: Path, only_line) -> None:
+    line = only_line("species", str(events), str(events), "--ladder", "66", option)
+    assert f"{option.partition('=')[0]} is for a single table" in line
 
 
 @pytest.fixture
@@ -153,15 +150,12 @@ def test_rates_stand_below_the_species(visits: Path, tmp_path: Path, capsys) -> 
 
 
 @pytest.mark.parametrize(
-    ("options", "status", "said"),
+    ("options", "said"),
     [
-        ("--frame-rate 0", 2, "--frame-rate 0: give one number above 0"),
-        ("--frames 0:100", 2, "--frames 0:100 is for rates, which need --frame-rate"),
-        ("--frames x --frame-rate 3", 2, "write it as A:B"),
+        ("--frame-rate 0", "--frame-rate 0: give one number above 0"),
+        ("--frames 0:100", "--frames 0:100 is for rates, which need --frame-rate"),
+        ("--frames x --frame-rate 3", "write it as A:B"),
     ],
 )
-def test_rates_that_cannot_be_are_refused(
-    options: str, status: int, said: str, visits: Path, capsys
-) -> None:
-    assert main(["species", str(visits), *options.split()]) == status
-    assert said in capsys.readouterr().err
+def test_rates_that_cannot_be_are_refused(options: str, said: str, visits: Path, only_line) -> None:
+    assert said in only_line("species", str(visits), *options.split())

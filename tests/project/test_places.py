@@ -14,7 +14,7 @@ import iscat_analysis as ia
 from iscat_analysis.camera import Camera
 from iscat_analysis.config import with_absolute_paths
 from iscat_analysis.errors import DataError
-from iscat_analysis.executors import LocalExecutor, open_executor
+from iscat_analysis.executors import open_executor
 from iscat_analysis.movie import open_stack
 from iscat_analysis.search.chunks import Reader
 from iscat_analysis.threads import allotted, threads
@@ -28,7 +28,6 @@ def _job(number: int, *, progress: object = None) -> int:
 
 def test_here_is_one_after_the_other() -> None:
     with open_executor() as place:
-        assert isinstance(place, LocalExecutor)
         assert not place.distant
         assert list(place.each(lambda n: place.call(_job, n), [3, 4])) == [(0, 6), (1, 8)]
         assert place.warnings(1000) == []

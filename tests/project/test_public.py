@@ -166,14 +166,20 @@ def test_an_array_is_fitted_as_the_file_that_holds_it(unsampled, result) -> None
     assert len(unsampled.summary["input"]["sha256"]) == 64
 
 
-def test_named_arguments_win(movie, config) -> None:
-    found = ia.fit_movie(
+def test_named_arguments_win(movie, config, monkeypatch) -> None:
+    given: list[ia.Config] = []
+
+    def analyse(_: ia.Stack, resolved: ia.Config, **__: Any) -> None:
+        given.append(resolved)
+
+    monkeypatch.setattr(shown, "analyse", analyse)
+    ia.fit_movie(
         movie, config=config, mode="joint", frames=(60, 100), workers=1, posterior=False,
         settings={"fit.mode": "mass", "fit.roi_nm": 2000.0, "optics.focus_nm": -300.0},
     )  # fmt: skip
-    assert found.mode == "joint"
-    assert found.summary["frames_after"] == [60, 100]
-    assert "roi_nm = 2000.0" in found.config_toml
+    (found,) = given
+    assert (found.fit.mode, found.fit.frames, found.fit.roi_nm) == ("joint", (60, 100), 2000.0)
+    assert (found.compute.workers, found.posterior.enabled) == (1, False)
 
 
 def test_the_table_is_a_frame(result) -> None:
