@@ -35,10 +35,7 @@ from iscat_analysis.movie.stack import ArrayFrames, Frames
 from iscat_analysis.reading import open_regular
 from iscat_analysis.records import StackMetadata
 from iscat_analysis.scratch import Scratch
-
-SHOWN_NAMES = 5
-"""Names of arrays in a message."""
-
+from iscat_analysis.units import listed
 
 _OF_ARCHIVES = (zipfile.BadZipFile, zlib.error, EOFError)
 
@@ -82,19 +79,15 @@ ReadMembers = Callable[[BinaryIO, Path], Mapping[str, Member | str]]
 
 def open_member(path: Path, part: str, *, read: ReadMembers, kind: str) -> Frames:
     """Open the array that is named, or the only one of frames."""
-    with open_regular(path) as file:
-        what, remedy = (
-            f"{path}: begins like {kind} but is damaged",
-            "copy it again or save it again",
-        )
-        with damaged(what, *_OF_ARCHIVES, remedy=remedy):
-            members = read(file, path)
-            if not members:
-                raise DataError(f"{path}: is {kind} that holds no array; export the movie as TIFF")
-            name, member = _chosen(path, part, members)
-            alone = part or len(members) == 1
-            notes = () if alone else (f"its frames are those of the array {name}",)
-            return _frames(member, f"{path}{MARK}{name}", path, notes)
+    what, remedy = f"{path}: begins like {kind} but is damaged", "copy it again or save it again"
+    with open_regular(path) as file, damaged(what, *_OF_ARCHIVES, remedy=remedy):
+        members = read(file, path)
+        if not members:
+            raise DataError(f"{path}: is {kind} that holds no array; export the movie as TIFF")
+        name, member = _chosen(path, part, members)
+        alone = part or len(members) == 1
+        notes = () if alone else (f"its frames are those of the array {name}",)
+        return _frames(member, f"{path}{MARK}{name}", path, notes)
 
 
 def holds_one(path: Path, *, read: ReadMembers) -> bool:
@@ -113,9 +106,8 @@ def is_movie(shape: Sequence[int]) -> bool:
 
 def name_one(path: Path, names: Sequence[str], what: str) -> DataError:
     """Ask for a name where a file holds several movies."""
-    shown = ", ".join(names[:SHOWN_NAMES]) + (", …" if len(names) > SHOWN_NAMES else "")
     return DataError(
-        f"{path}: holds {len(names)} {what} of frames ({shown}); name one, as in "
+        f"{path}: holds {len(names)} {what} of frames ({listed(names, 5)}); name one, as in "
         f'"{path}{MARK}{names[0]}"'
     )
 
@@ -127,46 +119,37 @@ def _chosen(path: Path, part: str, members: Mapping[str, Member | str]) -> tuple
     wanted = part.strip("/") if part else next(iter(movies), "")
     if wanted in movies:
         return wanted, movies[wanted]
-    others = {name: str(held) for name, held in members.items() if name not in movies}
-    if wanted in others:
-        others = {wanted: others[wanted]}
-    held = "; ".join(f"{name} {text}" for name, text in list(others.items())[:SHOWN_NAMES])
-    if part and wanted not in members:
-        held = "is not there"
+    held = f"{wanted} {members.get(wanted, 'is not there')}"
+    if not part:
+        held = "; ".join(f"{name} {text}" for name, text in list(members.items())[:5])
     raise DataError(
         f"{path}{MARK + part if part else ''}: {held}; frames, several of each axis, are in: "
-        f"{', '.join(list(movies)[:SHOWN_NAMES]) or 'none'}"
+        f"{listed(movies, 5) or 'none'}"
     )
 
 
 def _frames(member: Member, name: str, path: Path, notes: tuple[str, ...]) -> Frames:
     shape, stored, axes = member.shape, member.stored, member.axes
-    if member.unpack is None:
-        if member.nbytes > member.size:
-            raise DataError(
-                f"{name}: is truncated ({member.size} of {member.nbytes} bytes are there); copy "
-                "the file again or save it again"
-            )
-        return MappedFrames(path, shape, stored, offset=member.place, axes=axes, notes=notes)
-    refuse_growth(member.nbytes, member.size, f"{name}: it")
-    room = Scratch((member.nbytes,), np.dtype(np.uint8)).array
-    with member.unpack() as packed:
-        filled, view = 0, room.data
-        while filled < len(view) and (count := packed.readinto(view[filled:])):
-            filled += count
-    if filled < len(view):
+    filled = member.size
+    if member.unpack is not None:
+        refuse_growth(member.nbytes, member.size, f"{name}: it")
+        room, filled = Scratch((member.nbytes,), np.dtype(np.uint8)).array, 0
+        with member.unpack() as packed:
+            while filled < room.size and (count := packed.readinto(room.data[filled:])):
+                filled += count
+    if filled < member.nbytes:
         raise DataError(
-            f"{name}: is truncated ({filled} of {len(view)} bytes are there); copy the file again "
-            "or save it again"
+            f"{name}: is truncated ({filled} of {member.nbytes} bytes are there); copy the file "
+            "again or save it again"
         )
+    if member.unpack is None:
+        return MappedFrames(path, shape, stored, offset=member.place, axes=axes, notes=notes)
     return ArrayFrames(as_frames(room, shape, stored, axes), name, StackMetadata(), notes)
 
 
 _SUFFIX = ".npy"
 _LOCAL_HEADER = struct.Struct("<26xHH")  # lengths of the name, and of what is added to it
-_ENCRYPTED = 1
-_LARGEST_NPY_HEADER = 2**16  # of an array, unpacked
-_MOST_ARRAYS = 1000
+_MOST_ARRAYS = 1000  # that are looked at
 
 
 def arrays_of_npz(file: BinaryIO, path: Path) -> dict[str, Member | str]:
@@ -182,10 +165,10 @@ def arrays_of_npz(file: BinaryIO, path: Path) -> dict[str, Member | str]:
 def _held(
     archive: zipfile.ZipFile, info: zipfile.ZipInfo, file: BinaryIO, path: Path
 ) -> Member | str:
-    if info.flag_bits & _ENCRYPTED:
+    if info.flag_bits & 1:
         return "is encrypted"
     with archive.open(info) as packed:
-        header = read_header(io.BytesIO(packed.read(_LARGEST_NPY_HEADER)), path)
+        header = read_header(io.BytesIO(packed.read(2**16)), path)  # no header is longer
     if header.stored.hasobject:
         return "holds Python objects, which are not read"
     if header.stored.kind not in "uif" or not is_movie(header.shape):
@@ -216,11 +199,6 @@ _CLASSES = {
     1: "a cell array", 2: "a struct", 3: "an object", 4: "text", 5: "a sparse matrix",
     16: "a function", 17: "an object",
 }  # fmt: skip
-_COMPLEX = 0x800
-_OPAQUE = 17  # which has no shape
-_LARGEST_HEADER = 4096  # bytes of a shape or a name
-_MOST_ARRAYS = 1000
-_BLOCK = 65_536
 
 
 class _Inflating(io.RawIOBase):
@@ -241,7 +219,7 @@ class _Inflating(io.RawIOBase):
             packed = self._inflate.unconsumed_tail
             if not packed:
                 self._file.seek(self._at)
-                packed = self._file.read(min(_BLOCK, self._end - self._at))
+                packed = self._file.read(min(2**16, self._end - self._at))
                 self._at += len(packed)
             if not packed:
                 break
@@ -311,13 +289,13 @@ def _variable(
     (word, _), length = struct.unpack(f"{order}II", _element(stream, order)[0][:8]), 16
     lengths = [skipped, length]
     code, shape = word & 0xFF, []
-    if code != _OPAQUE:
+    if code != 17:  # an object, which has no shape
         raw, length = _element(stream, order)
         shape = np.frombuffer(raw, f"{order}i4").tolist()
         lengths.append(length)
     raw, length = _element(stream, order)
     name = raw.decode("utf-8", "replace")
-    if code in _CLASSES or word & _COMPLEX:
+    if code in _CLASSES or word & 0x800:
         return name, f"is {_CLASSES.get(code, 'complex')}"
     frames = (shape[-1], *shape[:2])
     if len(shape) < 3 or set(shape[2:-1]) - {1} or not is_movie(frames):
@@ -335,7 +313,7 @@ def _element(stream: BinaryIO, order: str) -> tuple[bytes, int]:
     kind, size = struct.unpack(f"{order}II", head)
     if kind >> 16:  # up to four bytes lie in the head itself
         return head[4 : 4 + (kind >> 16)], 8
-    if size > _LARGEST_HEADER:
+    if size > 4096:
         raise ValueError(f"a shape or a name of {size} bytes")
     padded = -(-size // 8) * 8
     raw = stream.read(padded)

@@ -24,20 +24,25 @@ from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
-from iscat_analysis.movie.containers import SHOWN_NAMES, name_one
+from iscat_analysis.movie.containers import name_one
 from iscat_analysis.movie.descriptions import Hints, merge
 from iscat_analysis.movie.hdf5 import Hdf5Reader, StoredArray
-from iscat_analysis.movie.mapped import Writer, refuse_changed
+from iscat_analysis.movie.mapped import (
+    HARMLESS_BYTES,
+    MOST_FRAME_DECODED_RATIO,
+    Writer,
+    refuse_changed,
+)
 from iscat_analysis.movie.side_files import positive
 from iscat_analysis.movie.stack import Frames
 from iscat_analysis.records import StackMetadata
+from iscat_analysis.units import listed
 
 PIXEL_NM = {"Refeyn OneMP": 19.3, "Refeyn TwoMP": 11.8}
 """Side of an unbinned pixel by instrument [nm]; the files do not store it."""
 
-_BLOCK_BYTES = 64_000_000
-ANCHOR_BYTES = 64_000_000  # of decoded frames kept, from which later ones are reached
-_MOST_FRAME_DECODED_RATIO = 100  # of one decoded frame over the file
+ANCHOR_BYTES = HARMLESS_BYTES
+"""Of decoded frames kept, from which later ones are reached."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +129,7 @@ class DifferenceFrames(DatasetFrames):
         frame_bytes = self.shape[1] * self.shape[2] * stored.dtype.itemsize
         kept = max(1, min(self.shape[0], ANCHOR_BYTES // frame_bytes))
         self._spacing = -(-self.shape[0] // kept)
-        self._step = max(1, _BLOCK_BYTES // frame_bytes)
+        self._step = max(1, HARMLESS_BYTES // frame_bytes)
         self._anchors: dict[int, NDArray[Any]] = {}
         self._newest: tuple[int, NDArray[Any]] | None = None
         self._lock = threading.Lock()
@@ -165,9 +170,8 @@ class DifferenceFrames(DatasetFrames):
         for number in range(-(-first // self._spacing) * self._spacing, end, self._spacing):
             self._anchors.setdefault(number, part[number - first].copy())
         self._newest = (end - 1, part[-1].copy())
-        if self._known is None or not first <= self._known[0] < end:
-            return
-        if not np.array_equal(part[self._known[0] - first], self._known[1]):
+        number, frame = self._known or (-1, part)
+        if first <= number < end and not np.array_equal(part[number - first], frame):
             raise DataError(
                 f"{self._path}: its frames do not add up to its last keyframe; "
                 "copy the file again or export it again"
@@ -192,7 +196,7 @@ def _open_refeyn(reader: Hdf5Reader, path: Path) -> DatasetFrames:
         )
     _, rows, columns = stored.shape
     frame_bytes = rows * columns * stored.dtype.itemsize
-    if frame_bytes > max(_BLOCK_BYTES, _MOST_FRAME_DECODED_RATIO * len(reader.data)):
+    if frame_bytes > max(HARMLESS_BYTES, MOST_FRAME_DECODED_RATIO * len(reader.data)):
         raise DataError(
             f"{path}: a frame of {rows} x {columns} pixels would be {frame_bytes} bytes, from a "
             f"file of {len(reader.data)}; the file is damaged, export it again"
@@ -272,11 +276,6 @@ def _described(
     return known, (note,)
 
 
-_MOST_NAMES = 1000  # that are looked at
-_MOST_GROUPS = 8  # one inside the other, in which movies are looked for; named, they may be deeper
-_OF_CELLS = "#"  # begins the names of groups in which MATLAB keeps what cells refer to
-
-
 def open_hdf5(path: Path, part: str, *, by_columns: bool = False) -> Frames:
     """Open a movie in an HDF5 file, with the axes (t, y, x) or, of MATLAB, (t, x, y)."""
     with closing(Hdf5Reader(path)) as reader:
@@ -294,10 +293,8 @@ def open_hdf5(path: Path, part: str, *, by_columns: bool = False) -> Frames:
             stored = reader.array(names[0])
             if stored is None or not _is_movie(stored.shape):
                 held = "is not there" if stored is None else f"has the shape {stored.shape}"
-                others = ", ".join(f"/{name}" for name in list(_movies(reader))[:SHOWN_NAMES])
-                raise DataError(
-                    f"{path}{MARK}{part}: {held}; frames (t, y, x) are in: {others or 'none'}"
-                )
+                others = listed((f"/{name}" for name in _movies(reader)), 5) or "none"
+                raise DataError(f"{path}{MARK}{part}: {held}; frames (t, y, x) are in: {others}")
             notes = [] if part else [f"its frames are those of the dataset /{names[0]}"]
             if reader.writer is not Writer.NONE:
                 notes.append(
@@ -324,12 +321,15 @@ def _is_movie(shape: tuple[int, ...]) -> bool:
 
 
 def _movies(reader: Hdf5Reader) -> Iterator[str]:
-    """Give the names of datasets that may be movies, all of whose frames may not be there."""
+    """Give the names of datasets that may be movies, all of whose frames may not be there.
+
+    Of many names a thousand are looked at, and groups that are eight deep.
+    """
     waiting, seen = [""], 0
-    while waiting and seen < _MOST_NAMES:
+    while waiting and seen < 1000:
         group = waiting.pop(0)
         for name in reader.names(group):
-            if name.startswith(_OF_CELLS):
+            if name.startswith("#"):  # a group in which MATLAB keeps what cells refer to
                 continue
             seen += 1
             whole = f"{group}/{name}" if group else name
@@ -338,7 +338,7 @@ def _movies(reader: Hdf5Reader) -> Iterator[str]:
             except DataError:  # links that lead elsewhere
                 continue
             if shape is None:
-                if whole.count("/") < _MOST_GROUPS:
+                if whole.count("/") < 8:
                     waiting.append(whole)
             elif _is_movie(shape) and min(shape[-2:]) > 1:
                 yield whole

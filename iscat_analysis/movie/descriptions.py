@@ -18,14 +18,8 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.side_files import inverse, positive, told_by
+from iscat_analysis.movie.side_files import inverse, number_in, positive, told_by
 from iscat_analysis.records import FloatArray, StackMetadata
-
-# |mean exp(2πi f t)| of times that tell the clock; a jitter of 0.19 intervals
-_LEAST_REGULARITY = 0.5
-_BLOCK = 64  # frames that tell the rate at first
-_REACH = 0.2  # of the rate by the median interval, where the true one is looked for
-_STEP = 0.1  # of the width of the maximum, 1/(time that passed)
 
 
 def measure_clock(times_s: Mapping[int, float]) -> tuple[float | None, tuple[int, ...] | None]:
@@ -49,7 +43,7 @@ def measure_clock(times_s: Mapping[int, float]) -> tuple[float | None, tuple[int
     middle = float(np.median(np.diff(times)))
     rate = _rate(times, 1 / middle) if middle > 0 else mean
     grid = np.mean(np.exp(2j * np.pi * rate * times))
-    if abs(grid) < _LEAST_REGULARITY:
+    if abs(grid) < 0.5:  # 1 where all are on it, 0.5 at a jitter of 0.19 intervals
         return mean, None
     behind = np.rint(rate * times - np.angle(grid) / (2 * np.pi)).astype(np.int64) - number
     ticks = number + np.minimum.accumulate(behind[::-1])[::-1]
@@ -59,11 +53,15 @@ def measure_clock(times_s: Mapping[int, float]) -> tuple[float | None, tuple[int
 
 
 def _rate(times: FloatArray, rate: float) -> float:
-    """Find the rate whose grid the times lie on, from a few of them to all."""
-    size, reach = min(_BLOCK, times.size), _REACH * rate
+    """Find the rate whose grid the times lie on, from a few of them to all.
+
+    It is looked for near the one of the median interval, in steps of a tenth of the width of the
+    maximum, 1/(time that passed).
+    """
+    size, reach = min(64, times.size), 0.2 * rate
     while True:
         block = times[:size]
-        step = _STEP / block[-1] if block[-1] > 0 else reach
+        step = 0.1 / block[-1] if block[-1] > 0 else reach
         rates = rate + np.arange(-reach, reach + step / 2, step)
         on_grid = [abs(np.exp(2j * np.pi * each * block).mean()) for each in rates]
         rate, reach = float(rates[int(np.argmax(on_grid))]), 2 * step
@@ -100,24 +98,17 @@ TIME_S = {
 }
 """Seconds in one unit of time, by its lower-case name (both Unicode micro signs)."""
 
-_TIME_LIKE = "TZQI"
-_MOST_CHANNELS = 7  # of an ImageJ composite
 _AXES = {"T": "time", "Z": "height", "C": "channel", "S": "sample", "P": "position"}
 _IMAGEJ_AXES = {"channels": "C", "slices": "Z", "frames": "T"}
 _MICRO_MANAGER_AXES = {"Frames": "T", "Slices": "Z", "Channels": "C", "Positions": "P"}
 _SHAPED = re.compile(r'^\{\s*"shape"\s*:')
-_LARGEST_INDEX = 2**62
-_DAY_S = 86_400.0
-_STRAIGHT_LINE = "0"  # number of ImageJ's calibration function c0 + c1·stored
 _ELECTRONS = {"e", "e-", "electron", "electrons", "photoelectron", "photoelectrons"}
 _ESCAPED = re.compile(r"\\u([0-9a-fA-F]{4})")
-_RATE_TOLERANCE = 0.01  # relative, between the interval that was set and the times of frames
-_LATE = 0.5  # intervals by which the first or the last frame of a short movie may have come late
 _COUNTS = {"", "gray value", "gray values", "count", "counts", "adu", "dn"}
-_MOST_DIGITS = 20  # any count of more digits is beyond every file, and stays so when cut
+MOST_DIGITS = 20
+"""Any count of more digits is beyond every file, and stays so when it is cut."""
+
 _RESOLUTION_UNIT_NM = {2: LENGTH_NM["inch"], 3: LENGTH_NM["cm"]}
-_PLAUSIBLE_PIXEL_NM = (5.0, 5000.0)  # outside: a printer's 72 or 300 dpi, not a microscope
-_SQUARE_TOLERANCE = 1e-3  # relative; writers round resolutions to six digits or fewer
 
 Resolution = tuple[float, float, int]
 """Pixels per unit along x and y, and TIFF's number of the unit."""
@@ -172,7 +163,7 @@ def time_axis(sizes: Mapping[str, int], path: Path) -> str | None:
             "movie; if its images are frames, name their axis T and export the file again "
             "(in Fiji: Image > Properties)"
         )
-    if axis not in _TIME_LIKE and not (axis == "C" and long[axis] > _MOST_CHANNELS):
+    if axis not in "TZQI" and not (axis == "C" and long[axis] > 7):
         raise DataError(
             f"{path}: its only axis besides y and x is {shown(long)}, which is not time; "
             "declare it as frames (in Fiji: Image > Properties), or export one channel or position"
@@ -229,20 +220,20 @@ def _imagej_counts(fields: Mapping[str, str]) -> tuple[float | None, float | Non
     Lines to other quantities, such as optical densities, tell nothing of the camera.
     """
     unit, slope = fields.get("vunit", "").lower(), positive(fields.get("c1"))
-    if fields.get("cf") != _STRAIGHT_LINE or slope is None or unit not in _ELECTRONS | _COUNTS:
+    if fields.get("cf") != "0" or slope is None or unit not in _ELECTRONS | _COUNTS:
         return None, None
     try:
-        zero = -float(fields.get("c0", "")) / slope
+        zero = -float(fields.get("c0", "")) / slope + 0.0  # no -0
     except ValueError:
         return None, None
     if not math.isfinite(zero):
         return None, None
-    return slope if unit in _ELECTRONS else None, zero + 0.0  # no -0
+    return slope if unit in _ELECTRONS else None, zero
 
 
 def micro_manager_axes(summary: Mapping[str, Any]) -> dict[str, int]:
     """Planned lengths of Micro-Manager's axes that the summary of an acquisition names."""
-    lengths = {axis: _mm_number(summary.get(key)) for key, axis in _MICRO_MANAGER_AXES.items()}
+    lengths = {axis: number_in(summary.get(key)) for key, axis in _MICRO_MANAGER_AXES.items()}
     return {axis: int(length) for axis, length in lengths.items() if length is not None}
 
 
@@ -255,7 +246,7 @@ def elapsed_ms(frame: object) -> float | None:
 def frame_index(frame: object) -> int | None:
     """Read the number that Micro-Manager gave a frame; None where its metadata are silent."""
     value = _mm_value(frame.get("FrameIndex")) if isinstance(frame, dict) else None
-    return value if type(value) is int and 0 <= value < _LARGEST_INDEX else None
+    return value if type(value) is int and 0 <= value < 2**62 else None
 
 
 def chosen_rate(
@@ -272,7 +263,8 @@ def chosen_rate(
     """
     own, ticks = clock
     intervals = (ticks[-1] if ticks else frames - 1) or 1
-    tolerance = max(_RATE_TOLERANCE, _LATE / intervals)
+    # the first or the last frame of a short movie may have come half an interval late
+    tolerance = max(0.01, 0.5 / intervals)
     if own is None or nominal is None or abs(own / nominal - 1) <= tolerance:
         return nominal or own, ()
     return own, (
@@ -288,7 +280,7 @@ def micro_manager_hints(
     begin = first if isinstance(first, dict) else {}
 
     def find(name: str) -> float | None:
-        return _mm_number(begin.get(name)) or _mm_number(summary.get(name))
+        return number_in(begin.get(name)) or number_in(summary.get(name))
 
     pixel = positive(find("PixelSizeUm"), 1e3)
     exposure = find("Exposure-ms")
@@ -313,7 +305,7 @@ def metamorph_hints(settings: object, planes: object) -> Hints:
     unit = LENGTH_NM.get(str(said.get("CalibrationUnits", "")).lower())
     x_nm, y_nm = (positive(said.get(f"{axis}Calibration"), unit) if unit else None for axis in "XY")
     days, ms = (np.asarray(times.get(name, ()), float) for name in ("DateCreated", "TimeCreated"))
-    rate, ticks = measure_clock(dict(enumerate((_DAY_S * (days - days[:1]) + ms / 1e3).tolist())))
+    rate, ticks = measure_clock(dict(enumerate((86_400 * (days - days[:1]) + ms / 1e3).tolist())))
     known = StackMetadata(x_nm, frame_rate_hz=rate, ticks=ticks, source="metamorph")
     return Hints(known, y_nm)
 
@@ -334,7 +326,7 @@ def merge(hints: Sequence[Hints], path: Path) -> StackMetadata:
     for hint in hints:
         fresh = {key: value for key, value in hint.known.values.items() if key not in found}
         x, y = hint.known.pixel_size_nm, hint.pixel_y_nm
-        if "pixel_size_nm" in fresh and x and y and abs(y / x - 1) > _SQUARE_TOLERANCE:
+        if "pixel_size_nm" in fresh and x and y and abs(y / x - 1) > 1e-3:  # some have six digits
             raise DataError(
                 f"{path}: its pixels measure {x:g} nm in x and {y:g} nm in y, but they must be "
                 "square; correct the metadata, or resample the movie"
@@ -345,8 +337,8 @@ def merge(hints: Sequence[Hints], path: Path) -> StackMetadata:
 
 
 def _plausible(*sizes_nm: float | None) -> bool:
-    low, high = _PLAUSIBLE_PIXEL_NM
-    return all(size is not None and low <= size <= high for size in sizes_nm)
+    """Tell sizes of a microscope's pixels from a printer's 72 or 300 dpi."""
+    return all(size is not None and 5.0 <= size <= 5000.0 for size in sizes_nm)
 
 
 def _imagej_fields(text: str) -> dict[str, str]:
@@ -356,7 +348,7 @@ def _imagej_fields(text: str) -> dict[str, str]:
 
 
 def _count(value: str) -> int:
-    return max(1, int(value[:_MOST_DIGITS])) if value.isascii() and value.isdigit() else 1
+    return max(1, int(value[:MOST_DIGITS])) if value.isascii() and value.isdigit() else 1
 
 
 def _json_object(text: str) -> dict[str, Any]:
@@ -370,7 +362,3 @@ def _json_object(text: str) -> dict[str, Any]:
 def _mm_value(value: object) -> object:
     """Unwrap a value that Micro-Manager 2 wraps as a property of a device."""
     return value.get("PropVal") if isinstance(value, dict) else value
-
-
-def _mm_number(value: object) -> float | None:
-    return positive(_mm_value(value))

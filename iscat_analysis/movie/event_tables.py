@@ -11,8 +11,8 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,45 +54,15 @@ _NAMES: Mapping[str, Mapping[str, float]] = {
 }  # fmt: skip
 """What each column is called in the files, the first first, and what its values are times."""
 
-_LOCS: Mapping[str, str] = {
-    "frame": "frame", "x_px": "x", "y_px": "y", "contrast": "contrast", "mass_kda": "mass_kda",
-    "sigma_mass_kda": "sigma_mass_kda", "snr": "snr",
-}  # fmt: skip
-"""The same in Picasso's ``locs``; its own program knows the first three."""
-
 _OURS = ("fits.parquet", "fits.csv")
 _OF_TRACKPY = {"x", "y", "frame", "mass", "signal"}
 _CALIBRATIONS = (
-    ("mass_model/c_1kDa", "mass_model/o_0kDa", "mass_model/contrasts", "mass_model/masses"),
-    (
-        "calibration/gradient",
-        "calibration/offset",
-        "calibration/contrasts",
-        "calibration/calibrated_values",
-    ),
+    ("mass_model/c_1kDa", "mass_model/o_0kDa"),
+    ("calibration/gradient", "calibration/offset"),
 )
+"""Gradient and offset of a mass calibration."""
 _GROUPS = ("", "analysis/events/events_fitted/")  # tables of their own, and inside .mpr movies
 _MOVIES = "per_movie_events"
-_MISSING = 1e300  # the largest double stands for "none"
-_LARGEST_FRAME = 2**53
-_USUAL_KDA = (1.0, 2e4)  # medians of masses beyond are likely in another unit than their heading
-
-
-@dataclass(frozen=True)
-class StoredCalibration:
-    """The calibration that a table carries."""
-
-    gradient_per_kda: float
-    offset: float
-    standard_masses_kda: tuple[float, ...] = ()
-    standard_contrasts: tuple[float, ...] = ()
-
-    def mass_kda(self, contrast: FloatArray) -> FloatArray:
-        """Convert contrasts to masses."""
-        masses: FloatArray = (
-            np.sign(-contrast) * (-np.abs(contrast) - self.offset) / self.gradient_per_kda
-        )
-        return masses
 
 
 def read_events(path: Path) -> pd.DataFrame:
@@ -114,8 +84,14 @@ def read_events(path: Path) -> pd.DataFrame:
     try:
         with open_regular(file) as opened:
             signature = opened.read(len(HDF5_SIGNATURE))
-        if signature.startswith(b"PAR1"):
+        if signature == HDF5_SIGNATURE:
+            table = _from_hdf5(file, movie)
+        elif movie:
+            raise _of_one_movie(file, movie)
+        elif signature.startswith(b"PAR1"):
             table = named(read_parquet(file), path)
+        else:
+            table = _from_text(file)
     except OSError as error:
         raise DataError(
             f"{path}: cannot be read ({error.strerror}); give the path of one table of events"
@@ -124,12 +100,6 @@ def read_events(path: Path) -> pd.DataFrame:
         raise DataError(
             f"{path}: cannot be read as a table ({first_line(error)}); export it again"
         ) from None
-    if signature == HDF5_SIGNATURE:
-        table = _from_hdf5(file, movie)
-    elif movie:
-        raise _of_one_movie(file, movie)
-    elif not signature.startswith(b"PAR1"):
-        table = _from_text(file)
     table.attrs["file"] = str(file)
     return table
 
@@ -164,31 +134,17 @@ def named(table: pd.DataFrame, source: object) -> pd.DataFrame:
                 f"{source}: holds in {name} what is no number ({first_line(error)}); correct the "
                 "table"
             ) from None
-    made = _table(numbers, None, source, factors)
-    made.attrs |= {key: table.attrs[key] for key in ("calibration",) if key in table.attrs}
-    return made
-
-
-def stored_calibration(table: pd.DataFrame) -> StoredCalibration | None:
-    """Return the calibration that came with a table."""
-    fields = table.attrs.get("calibration")
-    if fields is None:
-        return None
-    return StoredCalibration(
-        fields["gradient_per_kda"],
-        fields["offset"],
-        tuple(fields["standard_masses_kda"]),
-        tuple(fields["standard_contrasts"]),
-    )
+    return _table(numbers, source, factors)
 
 
 def _table(
     columns: Mapping[str, Any],
-    calibration: StoredCalibration | None,
     source: object,
-    factors: Mapping[str, float] | None = None,
+    factors: Mapping[str, float] = MappingProxyType({}),
+    line: tuple[float, float] | None = None,
     notes: Iterable[str] = (),
 ) -> pd.DataFrame:
+    """Put columns together; where none has masses, a line (gradient, offset) tells them."""
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:
         called = {name: next(iter(_NAMES[name])) for name in lengths}
@@ -198,15 +154,15 @@ def _table(
     known = {**dict.fromkeys(TABLE_COLUMNS, nothing), **columns}
     for name, values in known.items():
         if name not in TEXTS:
-            factor = (factors or {}).get(name, 1.0)
+            factor = factors.get(name, 1.0)
             if math.isnan(factor):
                 raise DataError(
                     f"{source}: does not say the unit of its masses; name their column mass_kda, "
                     "or mass_da"
                 )
-            known[name] = factor * np.where(np.abs(values) < _MISSING, values, np.nan)
+            known[name] = factor * np.where(np.abs(values) < 1e300, values, np.nan)
     frame = known["frame"]
-    if (bad := (frame < 0) | (frame > _LARGEST_FRAME)).any():
+    if (bad := (frame < 0) | (frame > 2**53)).any():
         row = int(np.argmax(bad))
         raise DataError(
             f"{source}: the frame is {frame[row]:g} in row {row}, which is no frame number; export "
@@ -214,15 +170,10 @@ def _table(
         )
     if np.array_equal(frame, np.floor(frame)):
         known["frame"] = frame.astype(np.int64)
-    if calibration is not None and np.isnan(known["mass_kda"]).all():
-        known["mass_kda"] = calibration.mass_kda(known["contrast"])
+    if line is not None and np.isnan(known["mass_kda"]).all():
+        contrast = known["contrast"]
+        known["mass_kda"] = np.sign(-contrast) * (-np.abs(contrast) - line[1]) / line[0]
     table = pd.DataFrame({name: known[name] for name in _NAMES if name in known})
-    table.attrs["calibration"] = None
-    if calibration is not None:
-        fields = asdict(calibration).items()
-        table.attrs["calibration"] = {
-            key: list(value) if isinstance(value, tuple) else value for key, value in fields
-        }
     table.attrs["notes"] = list(notes)
     return table
 
@@ -230,30 +181,23 @@ def _table(
 def _from_hdf5(path: Path, movie: str) -> pd.DataFrame:
     from iscat_analysis.movie.hdf5 import Hdf5Reader  # h5py takes long
 
-    with closing(Hdf5Reader(path)) as reader:
-        try:
-            locs = reader.records("locs")
-            if locs is not None and movie:
-                raise _of_one_movie(path, movie)
-            if locs is not None:
-                return _table(_from_locs(locs, path), None, path)
-            groups = _groups(reader, path, movie)
-            tables = {name: _from_group(reader, group, path) for name, group in groups.items()}
-        finally:
-            reader.data.close()
+    with closing(Hdf5Reader(path)) as reader, closing(reader.data):
+        locs = reader.records("locs")
+        if locs is not None and movie:
+            raise _of_one_movie(path, movie)
+        if locs is not None:
+            return _table(_from_locs(locs, path), path)
+        groups = _groups(reader, path, movie)
+        tables = {name: _from_group(reader, group, path) for name, group in groups.items()}
     if len(tables) == 1:
         return next(iter(tables.values()))
     joined = pd.concat(
         [table.assign(movie=name) for name, table in tables.items()], ignore_index=True
     ).assign(frame=math.nan)
-    lines = [table.attrs["calibration"] for table in tables.values()]
-    joined.attrs = {
-        "calibration": lines[0] if all(line == lines[0] for line in lines) else None,
-        "notes": [
-            f"the events of {len(tables)} movies are taken together, without their frames, because "
-            f"each movie counts from 0; {path.name}{MARK}{next(iter(tables))} is one of them"
-        ],
-    }
+    joined.attrs["notes"] = [
+        f"the events of {len(tables)} movies are taken together, without their frames, because "
+        f"each movie counts from 0; {path.name}{MARK}{next(iter(tables))} is one of them"
+    ]
     return joined
 
 
@@ -270,27 +214,25 @@ def _from_group(reader: Hdf5Reader, group: str, path: Path) -> pd.DataFrame:
                 columns[column], factors[column] = values, kinds[kind]
     if "contrast" not in columns:
         raise DataError(f"{path}: contrasts is no column of numbers; export it again")
-    return _table(columns, _calibration(reader, group, path), path, factors)
+    return _table(columns, path, factors, _calibration(reader, group, path))
 
 
 def _from_locs(locs: StoredArray, path: Path) -> dict[str, FloatArray]:
     """Take Picasso's localisations for events, if they have masses."""
-    if "mass_kda" not in (locs.dtype.names or ()):
+    names = locs.dtype.names or ()
+    if "mass_kda" not in names:
         raise DataError(
             f"{path}: holds localisations of Picasso's, which have photons and no mass; give "
             "fits.csv, or localisations with a column mass_kda, as iscat export writes them"
         )
-    if "group" in (locs.dtype.names or ()):
+    if "group" in names:
         raise DataError(
             f"{path}: holds localisations in groups, many of one particle, and not events; give "
             "tracks.csv, which has one mass for each track"
         )
     rows = locs.read(0, locs.shape[0])
-    return {
-        column: rows[name].astype(np.float64)
-        for column, name in _LOCS.items()
-        if name in (locs.dtype.names or ())
-    }
+    wanted = {name.removesuffix("_px"): name for name in (*TABLE_COLUMNS, "sigma_mass_kda", "snr")}
+    return {wanted[name]: rows[name].astype(np.float64) for name in wanted if name in names}
 
 
 def _groups(reader: Hdf5Reader, path: Path, movie: str) -> dict[str, str]:
@@ -298,9 +240,7 @@ def _groups(reader: Hdf5Reader, path: Path, movie: str) -> dict[str, str]:
     movies = {name: f"{_MOVIES}/{name}/" for name in reader.names(_MOVIES)}
     groups = {**{group: group for group in _GROUPS}, **movies}
     found = {
-        name: group
-        for name, group in groups.items()
-        if "contrasts" in reader.names(group.rstrip("/"))
+        name: group for name, group in groups.items() if "contrasts" in reader.names(group[:-1])
     }
     if not found:
         raise DataError(
@@ -330,9 +270,10 @@ def _column(reader: Hdf5Reader, name: str, path: Path) -> FloatArray | None:
     return values
 
 
-def _calibration(reader: Hdf5Reader, group: str, path: Path) -> StoredCalibration | None:
+def _calibration(reader: Hdf5Reader, group: str, path: Path) -> tuple[float, float] | None:
+    """Read gradient [1/kDa] and offset of a table's mass calibration."""
     for prefix in dict.fromkeys((group, "")):
-        for gradient_name, offset_name, *standards in _CALIBRATIONS:
+        for gradient_name, offset_name in _CALIBRATIONS:
             gradient = reader.number(prefix + gradient_name)
             offset = reader.number(prefix + offset_name)
             if gradient is None or offset is None:
@@ -342,11 +283,7 @@ def _calibration(reader: Hdf5Reader, group: str, path: Path) -> StoredCalibratio
                     f"{path}: its calibration ({gradient_name} = {gradient:g}, {offset_name} = "
                     f"{offset:g}) cannot be used; calibrate again and export the table again"
                 )
-            known = [_column(reader, prefix + name, path) for name in standards]
-            contrasts, masses = (
-                () if values is None else tuple(map(float, values)) for values in known
-            )
-            return StoredCalibration(gradient, offset, masses, contrasts)
+            return gradient, offset
     return None
 
 
@@ -371,25 +308,23 @@ def _from_text(path: Path) -> pd.DataFrame:
         for name in TEXTS
         if name in cells.columns
     }
-    return _table({**columns, **texts}, None, path, factors, notes)
+    return _table({**columns, **texts}, path, factors, notes=notes)
 
 
 def unit_note(mass_kda: FloatArray) -> str | None:
     """Say where masses are so large or so small that their heading likely names another unit."""
     known = np.abs(mass_kda[np.isfinite(mass_kda)])
-    middle = float(np.median(known)) if known.size else math.nan
-    low, high = _USUAL_KDA
-    if middle > high:
-        return (
-            f"half of the events are heavier than {middle:.3g} kDa: if the masses are in Da, name "
-            "their column mass_da"
-        )
-    if 0 < middle < low:
-        return (
-            f"half of the events are lighter than {middle:.3g} kDa: if the masses are in kDa or "
-            "MDa, name their column mass_kda or mass_mda"
-        )
-    return None
+    middle = float(np.median(known)) if known.size else 0.0
+    if middle > 2e4:
+        how, units, names = "heavier", "Da", "mass_da"
+    elif 0 < middle < 1.0:
+        how, units, names = "lighter", "kDa or MDa", "mass_kda or mass_mda"
+    else:
+        return None
+    return (
+        f"half of the events are {how} than {middle:.3g} kDa: if the masses are in {units}, name "
+        f"their column {names}"
+    )
 
 
 def _plain(heading: str) -> str:

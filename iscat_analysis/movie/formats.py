@@ -166,8 +166,6 @@ FOREIGN = tuple(
 SUFFIXES = tuple(dict.fromkeys(suffix for kind in FORMATS for suffix in kind.suffixes))
 """Endings of files and folders that are taken for movies where a folder is searched for them."""
 
-_REMEMBERED = 4096  # files that were looked into
-
 
 def _needed() -> str:
     titles = [kind.title for kind in FORMATS]
@@ -250,26 +248,16 @@ def members_of(address: Path) -> tuple[Path, ...]:
     """Give the files of a set, or the file or folder itself, which tell one movie from another."""
     path, part = split_address(address)
     if path.suffix.lower() in TIFF_SUFFIXES and is_file(path):
-        names = _described(path, *_state(path))
+        names = _described(path, states_of([path]))
         if len(names) > 1:
             members = dict.fromkeys(path.with_name(name) if name else path for name in names)
             return tuple(file for file in {**members, path: None} if is_file(file))
     return (path,) if part else recorded_files(path)
 
 
-def _state(path: Path) -> tuple[int, int]:
-    """Size and modification time of a file, which tell it from earlier versions."""
-    try:
-        state = path.stat()
-    except OSError:
-        return 0, 0
-    return state.st_size, state.st_mtime_ns
-
-
-@lru_cache(maxsize=_REMEMBERED)
-def _described(path: Path, size: int, changed_ns: int) -> tuple[str, ...]:
-    """Name the files of the set that a file describes."""
-    del size, changed_ns
+@lru_cache(maxsize=4096)
+def _described(path: Path, _: tuple[tuple[int, ...], ...]) -> tuple[str, ...]:
+    """Name the files of the set that a file describes, in its present state."""
     try:
         text = next((text for text in first_texts(path) if is_ome(text)), "")
         return files_of_set(text, path) if "FileName" in text else ()
@@ -277,9 +265,8 @@ def _described(path: Path, size: int, changed_ns: int) -> tuple[str, ...]:
         return ()
 
 
-@lru_cache(maxsize=_REMEMBERED)
-def _holds_one(path: Path, size: int, changed_ns: int) -> bool:
-    del size, changed_ns
+@lru_cache(maxsize=4096)
+def _holds_one(path: Path, _: tuple[tuple[int, ...], ...]) -> bool:
     return next(kind for kind in FORMATS if path.suffix.lower() in kind.suffixes).holds_one(path)
 
 
@@ -291,7 +278,9 @@ def find_movies(folder: Path, *, but: Collection[Path] = ()) -> list[Path]:
     """
     inside = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     movies = [path for path in inside if path not in but and is_named_as_movie(path)]
-    return _once([p for p in movies if p.is_dir() or (p.is_file() and _holds_one(p, *_state(p)))])
+    return _once(
+        [p for p in movies if p.is_dir() or (p.is_file() and _holds_one(p, states_of([p])))]
+    )
 
 
 def is_named_as_movie(path: Path) -> bool:

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.tiff import TIFF_SUFFIXES, is_single_image, open_frame_file
 from iscat_analysis.reading import open_regular
+from iscat_analysis.units import listed
 
 _DIGITS = re.compile(r"(\d+)", flags=re.ASCII)
-_FEWEST_FOUND = 10  # frames that make a folder a movie where nobody says that it is one
-_SHOWN = 3  # names and numbers in a message
 
 
 def frames_in(folder: Path) -> tuple[Path, ...]:
@@ -32,10 +31,10 @@ def frames_in(folder: Path) -> tuple[Path, ...]:
 def holds_single_frames(folder: Path, *, named: bool = False) -> bool:
     """Tell whether a folder is a movie of TIFF files with one image each.
 
-    Unless somebody names it as a movie, it must have many files, whose numbers alone differ.
+    Unless somebody names it as a movie, it must have ten files, whose numbers alone differ.
     """
     files = frames_in(folder)
-    if len(files) < (2 if named else _FEWEST_FOUND):
+    if len(files) < (2 if named else 10):
         return False
     alike = named or len({*map(_pattern, files)}) == 1
     return alike and is_single_image(files[0]) and is_single_image(files[-1])
@@ -55,8 +54,14 @@ class FrameFiles:
         self.shape = (len(self.files), *self._expected[0][1:])
         self.dtype = self._expected[1]
         self._size = self.shape[1] * self.shape[2] * self.dtype.itemsize
-        like = _Around(self.files[0], place, self._size)
-        self._places = [like.find(file) or self._place(file) for file in self.files]
+        if place is None:
+            self._places = [self._place(file) for file in self.files]
+        else:  # headers that repeat are read once
+            around = _around(self.files[0], place, self._size)
+            self._places = [
+                place if _around(file, place, self._size) == around else self._place(file)
+                for file in self.files
+            ]
 
     def _place(self, file: Path) -> int | None:
         """Read the header of a file that is not like the first one."""
@@ -97,28 +102,16 @@ class FrameFiles:
         """Do nothing: no file is open."""
 
 
-class _Around:
-    """What a file holds around its pixels: headers that repeat are read once."""
-
-    def __init__(self, path: Path, place: int | None, size: int) -> None:
-        self._place, self._size = place, size
-        self._bytes = None if place is None else self._read(path, place)
-
-    def find(self, path: Path) -> int | None:
-        """Give the place of the pixels in a file that is the same around them."""
-        if self._place is None or self._bytes != self._read(path, self._place):
-            return None
-        return self._place
-
-    def _read(self, path: Path, place: int) -> tuple[bytes, bytes, int]:
-        try:
-            with open_regular(path) as file:
-                before = file.read(place)
-                end = file.seek(0, 2)
-                file.seek(place + self._size)
-                return before, file.read(), end
-        except OSError as error:
-            raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+def _around(path: Path, place: int, size: int) -> tuple[bytes, bytes, int]:
+    """Give what a file holds before and behind its pixels, and its length."""
+    try:
+        with open_regular(path) as file:
+            before = file.read(place)
+            end = file.seek(0, 2)
+            file.seek(place + size)
+            return before, file.read(), end
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from None
 
 
 def _parts(path: Path) -> list[str]:
@@ -140,7 +133,7 @@ def _refuse_mixture(files: Sequence[Path], folder: Path) -> None:
     if len(kinds) > 1:
         raise DataError(
             f"{folder}: holds TIFF files with different kinds of names "
-            f"({', '.join(kinds[:_SHOWN])}); leave only the frames of one movie there"
+            f"({', '.join(kinds[:3])}); leave only the frames of one movie there"
         )
 
 
@@ -162,10 +155,8 @@ def _refuse_gaps(files: Sequence[Path], folder: Path) -> None:
         every = np.arange(varying[0][0], varying[0][-1] + 1, step)
         missing = np.setdiff1d(every, varying[0])
         if 0 < missing.size < len(files):
-            named = ", ".join(map(str, missing[:_SHOWN].tolist()))
-            more = ", …" if missing.size > _SHOWN else ""
             raise DataError(
                 f"{folder}: of the numbers in the names of its files {missing.size} are missing "
-                f"({named}{more}); copy the folder again or, if these frames were left out on "
-                "purpose, number the files anew"
+                f"({listed(missing, 3)}); copy the folder again or, if these frames were left out "
+                "on purpose, number the files anew"
             )

@@ -12,8 +12,8 @@ from __future__ import annotations
 import math
 import mmap
 import struct
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -31,11 +31,11 @@ from iscat_analysis.movie.mapped import (
     map_file,
     refuse_changed,
     refuse_growth,
+    refuse_large_chunks,
     writer_of,
 )
-from iscat_analysis.movie.stack import Slabs
+from iscat_analysis.movie.stack import Read, in_slabs
 
-_LARGEST_CHUNK_BYTES = 2**28
 _LARGEST_TEXT_BYTES = 4096
 _HEAP = struct.Struct("<4s4xQ")  # signature, version, size of the whole
 _HEAP_OBJECT = struct.Struct("<H6xQ")  # index, then references and reserved bytes, size
@@ -73,9 +73,9 @@ class StoredArray:
         return self.stored.newbyteorder("=")
 
     @cached_property
-    def _slabs(self) -> Slabs:
+    def _in_slabs(self) -> Read:
         depth = self.chunk[0] if self.filters else 1
-        return Slabs(self._decoded, self.shape, self.dtype, depth)
+        return in_slabs(self._decoded, self.shape, self.dtype, depth)
 
     @cached_property
     def _grid(self) -> tuple[int, ...]:
@@ -90,7 +90,7 @@ class StoredArray:
             first = int(self.where[0, 0]) + start * math.prod(self.shape[1:]) * self.dtype.itemsize
             block[:] = np.ndarray(block.shape, self.stored, buffer=self.data, offset=first)
             return block
-        return self._slabs.read(start, stop)
+        return self._in_slabs(start, stop)
 
     def _decoded(self, start: int, stop: int) -> NDArray[Any]:
         """Decode the chunks of some rows, each once."""
@@ -162,43 +162,39 @@ class Hdf5Reader:
 
     def shape(self, name: str) -> tuple[int, ...] | None:
         """Give the shape of a dataset of numbers, written or not; None where there is none."""
-        with self._believing_nothing():
-            dataset = self._dataset(name)
-            if dataset is None or dataset.dtype.kind not in "iuf":
+        with self._dataset(name) as dataset:
+            if dataset is None or dataset.dtype.kind not in "iuf" or _is_elsewhere(dataset):
                 return None
-            return None if dataset.is_virtual or dataset.external else dataset.shape
+            return tuple(dataset.shape)
 
     def array(self, name: str) -> StoredArray | None:
         """Find a dataset of numbers and all of its bytes; None where there is none."""
-        with self._believing_nothing():
-            dataset = self._dataset(name)
+        with self._dataset(name) as dataset:
             if dataset is not None and dataset.dtype.names:
                 raise self._no_numbers(dataset, name)
             return None if dataset is None else self._stored(dataset, name)
 
     def records(self, name: str) -> StoredArray | None:
         """Find a table of named numbers, one value each; None where there is no such thing."""
-        with self._believing_nothing():
-            dataset = self._dataset(name)
+        with self._dataset(name) as dataset:
             if dataset is None or not dataset.dtype.names or len(dataset.shape or ()) != 1:
                 return None
             return self._stored(dataset, name)
 
     def number(self, name: str) -> float | None:
         """Read a dataset of one number; None where there is none, or it is something else."""
-        with self._believing_nothing():
-            dataset = self._dataset(name)
+        with self._dataset(name) as dataset:
             if dataset is None or dataset.dtype.kind not in "iuf" or not _single(dataset):
                 return None
             return float(np.asarray(dataset[()]).reshape(()))
 
     def text(self, name: str) -> str | None:
         """Read a dataset of one text; None where there is none, or it is something else."""
-        with self._believing_nothing():
-            dataset = self._dataset(name)
-            start = None if dataset is None else dataset.id.get_offset()
-            kind = None if dataset is None else h5py.check_string_dtype(dataset.dtype)
-            if dataset is None or start is None or kind is None or not _single(dataset):
+        with self._dataset(name) as dataset:
+            if dataset is None:
+                return None
+            start, kind = dataset.id.get_offset(), h5py.check_string_dtype(dataset.dtype)
+            if start is None or kind is None or not _single(dataset):
                 return None
             if kind.length is None:
                 return _heap_text(self.data, start)
@@ -206,20 +202,17 @@ class Hdf5Reader:
 
     def has_attribute(self, name: str, key: str) -> bool:
         """Whether something of this name is attached to a dataset; it may be a text in the heap."""
-        with self._believing_nothing():
-            dataset = self._dataset(name)
+        with self._dataset(name) as dataset:
             return dataset is not None and key in dataset.attrs
 
     def numbers(self, name: str, key: str) -> list[int] | None:
         """Read a list of integers attached to a dataset; None where there is no such thing."""
-        with self._believing_nothing():
-            dataset = self._dataset(name)
+        with self._dataset(name) as dataset:
             if dataset is None or key not in dataset.attrs:
                 return None
             attribute = dataset.attrs.get_id(key)
-            if attribute.dtype.kind not in "iu" or len(attribute.shape) != 1:
-                return None
-            return [int(value) for value in dataset.attrs[key]]
+            is_list = attribute.dtype.kind in "iu" and len(attribute.shape) == 1
+            return [int(value) for value in dataset.attrs[key]] if is_list else None
 
     def _believing_nothing(self) -> AbstractContextManager[None]:
         return damaged(f"{self._path}: begins like an HDF5 file but is damaged")
@@ -241,13 +234,15 @@ class Hdf5Reader:
             found = found[part]
         return found
 
-    def _dataset(self, name: str) -> h5py.Dataset | None:
-        found = self._find(name)
-        return found if isinstance(found, h5py.Dataset) else None
+    @contextmanager
+    def _dataset(self, name: str) -> Iterator[h5py.Dataset | None]:
+        with self._believing_nothing():
+            found = self._find(name)
+            yield found if isinstance(found, h5py.Dataset) else None
 
     def _stored(self, dataset: h5py.Dataset, name: str) -> StoredArray:
         dtype, shape = dataset.dtype, tuple(int(n) for n in dataset.shape or ())
-        if dataset.is_virtual or dataset.external:
+        if _is_elsewhere(dataset):
             raise DataError(
                 f"{self._path}: the data of {name} lie in other files; "
                 "export the file with its data inside"
@@ -287,11 +282,7 @@ class Hdf5Reader:
                 f"{self._path}: {name} is compressed by HDF5 filter {unknown[0]}, which is not "
                 "supported; save it uncompressed, or with Deflate or Zstandard"
             )
-        if math.prod(chunk) * dataset.dtype.itemsize > _LARGEST_CHUNK_BYTES:
-            raise DataError(
-                f"{self._path}: {name} is stored in chunks of {chunk}, too large to be decoded "
-                "one at a time; save it with smaller chunks"
-            )
+        refuse_large_chunks(chunk, dataset.dtype, f"{self._path}: {name}")
         grid = tuple(-(-n // c) for n, c in zip(dataset.shape, chunk, strict=True))
         expected = math.prod(grid)
         if expected > len(self.data):  # a chunk is a byte at least
@@ -343,6 +334,11 @@ def _chunks_count_from_user_block() -> bool:
         place = file["a"].id.get_chunk_info(0).byte_offset
         image = file.id.get_file_image()
     return bool(image.find(mark) == place)  # the image begins behind the block
+
+
+def _is_elsewhere(dataset: h5py.Dataset) -> bool:
+    """Whether the numbers of a dataset lie in other files."""
+    return bool(dataset.is_virtual or dataset.external)
 
 
 def _single(dataset: h5py.Dataset) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import struct
@@ -43,10 +44,12 @@ def damaged(
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """How HDF5 files begin."""
 
-_MOST_DECODED_RATIO = 2000  # decoded over stored; Deflate reaches 1032, on constant images only
-_HARMLESS_BYTES = 64_000_000  # smaller than this, anything is harmless whatever its ratio
-_MAPPED_ALONG = 2**16
-_WRITE_ACCESS, _READERS_ALLOWED = 1, 4  # bits of the flags in a superblock
+HARMLESS_BYTES = 64_000_000
+"""Whatever takes no more memory than this is harmless, whatever a file says of it."""
+
+
+MOST_FRAME_DECODED_RATIO = 100
+"""Of one frame, which is held in memory whole, decoded over stored."""
 
 
 class Writer(Enum):
@@ -64,11 +67,10 @@ def writer_of(path: Path) -> Writer:
     """Read the flags of an HDF5 file, which mean that in superblocks since version 3."""
     with open_regular(path) as file:
         head = file.read(12)
-    if len(head) < 12 or not head.startswith(HDF5_SIGNATURE) or head[8] < 3:
+    flags = head[11] if len(head) == 12 and head.startswith(HDF5_SIGNATURE) and head[8] > 2 else 0
+    if not flags & 1:  # open to write
         return Writer.NONE
-    if not head[11] & _WRITE_ACCESS:
-        return Writer.NONE
-    return Writer.WITH_READERS if head[11] & _READERS_ALLOWED else Writer.ALONE
+    return Writer.WITH_READERS if flags & 4 else Writer.ALONE
 
 
 def map_file(path: Path) -> mmap.mmap:
@@ -128,18 +130,31 @@ def refuse_changed(path: Path, data: mmap.mmap) -> None:
         )
 
 
-def refuse_growth(size: int, stored: int, what: str, *, ratio: int = _MOST_DECODED_RATIO) -> None:
-    """Refuse what decodes to far more than it was stored in."""
-    if size > max(_HARMLESS_BYTES, ratio * stored):
+def refuse_growth(size: int, stored: int, what: str, *, ratio: int = 2000) -> None:
+    """Refuse what decodes to far more than it was stored in.
+
+    Deflate reaches a ratio of 1032, on constant images only.
+    """
+    if size > max(HARMLESS_BYTES, ratio * stored):
         raise DataError(
             f"{what} would grow from {stored} to {size} bytes, which no recording does; the file "
             "is damaged, export it again"
         )
 
 
+def refuse_large_chunks(chunk: tuple[int, ...], dtype: np.dtype[Any], what: str) -> None:
+    """Refuse an array whose chunks take too much memory, since one is decoded at a time."""
+    if math.prod(chunk) * dtype.itemsize > 2**28:
+        raise DataError(
+            f"{what} is stored in chunks of {chunk}, too large to be decoded one at a time; save "
+            "it with smaller chunks"
+        )
+
+
 def release(data: mmap.mmap, start: int, stop: int) -> None:
     """Release mapped pages that were copied; the system counts them as memory of this process."""
-    first = max(start - _MAPPED_ALONG, 0) // mmap.PAGESIZE * mmap.PAGESIZE
-    last = min(stop + _MAPPED_ALONG, len(data))
+    along = 2**16  # which the system maps with what was asked for
+    first = max(start - along, 0) // mmap.PAGESIZE * mmap.PAGESIZE
+    last = min(stop + along, len(data))
     if last > first and hasattr(data, "madvise"):
         data.madvise(mmap.MADV_DONTNEED, first, last - first)

@@ -9,7 +9,7 @@ import math
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -80,55 +80,54 @@ class ReaderFrames:
 def open_nd2(path: Path, _: str = "") -> ReaderFrames:
     """Open a file of Nikon's."""
     nd2 = needed_package("nd2", "nd2", "Nikon ND2 files", path)
-    with _believing_nothing(path, "it is no ND2 file, or damaged"):
+    with _believing_nothing(path, "it is no ND2 file, or damaged"), ExitStack() as opened:
         file = nd2.ND2File(str(path))
-        try:
-            sizes = dict(file.sizes)
-            y, x = sizes.pop("Y"), sizes.pop("X")
-            axis = time_axis(sizes, path) or "T"
-            n_frames, said = sizes.get(axis, 1), file.attributes
-            if said.sequenceCount < n_frames:
-                raise DataError(
-                    f"{path}: describes {n_frames} frames but holds {said.sequenceCount}; the "
-                    "recording was interrupted: export those that are there"
-                )
-            if said.compressionType == "lossy":
-                raise DataError(f"{path}: its lossy compression keeps no counts; record without it")
-            hints = _if_readable(lambda: _nd2_hints(file, n_frames)) or Hints(StackMetadata())
-            return ReaderFrames(
-                path, (n_frames, y, x), np.dtype(file.dtype), hints,
-                axis=axis, frame=file.read_frame, close=file.close,
-            )  # fmt: skip
-        except BaseException:
-            file.close()
-            raise
+        opened.callback(file.close)
+        sizes = dict(file.sizes)
+        y, x = sizes.pop("Y"), sizes.pop("X")
+        axis = time_axis(sizes, path) or "T"
+        n_frames, said = sizes.get(axis, 1), file.attributes
+        if said.sequenceCount < n_frames:
+            raise DataError(
+                f"{path}: describes {n_frames} frames but holds {said.sequenceCount}; the "
+                "recording was interrupted: export those that are there"
+            )
+        if said.compressionType == "lossy":
+            raise DataError(f"{path}: its lossy compression keeps no counts; record without it")
+        hints = _if_readable(lambda: _nd2_hints(file, n_frames))
+        shape, dtype = (n_frames, y, x), np.dtype(file.dtype)
+        frames = ReaderFrames(
+            path, shape, dtype, hints, axis=axis, frame=file.read_frame, close=file.close
+        )
+        opened.pop_all()
+        return frames
 
 
 def open_czi(path: Path, _: str = "") -> ReaderFrames:
     """Open a file of Zeiss'."""
     czi = needed_package("pylibCZIrw.czi", "czi", "Zeiss CZI files", path)
-    with _believing_nothing(path, "it is no CZI file, or damaged"):
+    with _believing_nothing(path, "it is no CZI file, or damaged"), ExitStack() as opened:
         file = czi.CziReader(str(path))
-        try:
-            ranges = {axis: last - first for axis, (first, last) in file.total_bounding_box.items()}
-            y, x = ranges.pop("Y"), ranges.pop("X")
-            ranges["scene"] = max(len(file.scenes_bounding_rectangle), 1)
-            axis = time_axis(ranges, path) or "T"
-            kinds = set(file.pixel_types.values())
-            if not kinds <= set(_CZI_TYPES) or len(kinds) != 1:
-                raise DataError(
-                    f"{path}: holds pixels of type {', '.join(sorted(kinds)) or 'unknown'}; export "
-                    "the camera's grey values"
-                )
-            hints = _if_readable(lambda: _czi_hints(file)) or Hints(StackMetadata())
-            return ReaderFrames(
-                path, (ranges[axis], y, x), np.dtype(_CZI_TYPES[kinds.pop()]), hints,
-                axis=axis, frame=lambda k: np.asarray(file.read(plane={axis: k})),
-                close=file.close,
-            )  # fmt: skip
-        except BaseException:
-            file.close()
-            raise
+        opened.callback(file.close)
+        ranges = {axis: last - first for axis, (first, last) in file.total_bounding_box.items()}
+        y, x = ranges.pop("Y"), ranges.pop("X")
+        ranges["scene"] = max(len(file.scenes_bounding_rectangle), 1)
+        axis = time_axis(ranges, path) or "T"
+        kinds = set(file.pixel_types.values())
+        if not kinds <= set(_CZI_TYPES) or len(kinds) != 1:
+            raise DataError(
+                f"{path}: holds pixels of type {', '.join(sorted(kinds)) or 'unknown'}; export "
+                "the camera's grey values"
+            )
+        hints = _if_readable(lambda: _czi_hints(file))
+        shape, dtype = (ranges[axis], y, x), np.dtype(_CZI_TYPES[kinds.pop()])
+
+        def frame(number: int) -> NDArray[Any]:
+            return np.asarray(file.read(plane={axis: number}))
+
+        frames = ReaderFrames(path, shape, dtype, hints, axis=axis, frame=frame, close=file.close)
+        opened.pop_all()
+        return frames
 
 
 def _nd2_hints(file: Any, n_frames: int) -> Hints:
@@ -160,12 +159,12 @@ def _czi_hints(file: Any) -> Hints:
     return Hints(known, positive(metres.get("Y"), 1e9))
 
 
-def _if_readable(read: Callable[[], Hints]) -> Hints | None:
+def _if_readable(read: Callable[[], Hints]) -> Hints:
     """Do without metadata that a package cannot read."""
     try:
         return read()
     except Exception:
-        return None
+        return Hints(StackMetadata())
 
 
 def needed_package(name: str, extra: str, what: str, path: Path) -> Any:

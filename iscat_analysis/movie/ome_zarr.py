@@ -18,7 +18,7 @@ import math
 import os
 import stat
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,17 +32,13 @@ from zarr.storage import LocalStore
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
 from iscat_analysis.movie.descriptions import LENGTH_NM, TIME_S, Hints, merge
-from iscat_analysis.movie.mapped import damaged, refuse_growth
+from iscat_analysis.movie.mapped import damaged, refuse_growth, refuse_large_chunks
 from iscat_analysis.movie.side_files import inverse, positive
 from iscat_analysis.movie.stack import ArrayFrames
 from iscat_analysis.reading import LARGEST_TEXT_BYTES
 from iscat_analysis.records import StackMetadata
 
 _TEXTS = ("zarr.json", ".zgroup", ".zarray", ".zattrs", ".zmetadata")
-_LARGEST_CHUNK_BYTES = 2**28
-_GROWTH = 2  # of a chunk that a codec cannot compress, at most; and room for its header
-_HEADER_BYTES = 65_536
-_NOTHING = 2**64 - 1  # in the index of a shard, of a chunk that was not written
 
 
 class CheckedStore(LocalStore):
@@ -51,7 +47,6 @@ class CheckedStore(LocalStore):
     def __init__(self, folder: Path) -> None:
         super().__init__(folder, read_only=True)
         self.sizes = _sizes(folder)
-        self.most = LARGEST_TEXT_BYTES
         self.complete = False
         """Whether whatever is asked for must be there."""
 
@@ -62,21 +57,11 @@ class CheckedStore(LocalStore):
         byte_range: ByteRequest | None = None,
     ) -> Buffer | None:
         """Read a file, or a part of it."""
-        path = Path(self.root) / key
-        try:
-            state = path.stat()
-        except OSError:
-            state = None
-        if state is not None and not stat.S_ISREG(state.st_mode):
-            raise DataError(f"{path}: is a pipe, a device or a folder where a file should be")
-        if state is not None and byte_range is None and state.st_size > self.most:
-            raise DataError(
-                f"{path}: has {state.st_size} bytes where {self.most} are the most; it is damaged, "
-                "copy it again or export it again"
-            )
-        found = None if state is None else await super().get(key, prototype, byte_range)
+        found = await super().get(key, prototype, byte_range)
         if found is None and self.complete:
-            raise DataError(f"{path}: is missing; copy the movie again or export it again")
+            raise DataError(
+                f"{self.root}/{key}: is missing; copy the movie again or export it again"
+            )
         return found
 
 
@@ -93,8 +78,6 @@ class CheckedArray:
         self.shape = shape
         self.depth = int((array.shards or array.chunks)[0])
         """Frames that are stored together."""
-        store.most = _GROWTH * math.prod(array.shards or array.chunks) * self.dtype.itemsize
-        store.most += _HEADER_BYTES
         store.complete = True
 
     def __getitem__(self, key: slice, /) -> NDArray[Any]:
@@ -123,17 +106,15 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 def _refuse_incomplete(array: Any, shape: tuple[int, ...], store: CheckedStore, name: str) -> None:
     """Refuse an array that declares more than its folder holds, or lacks a chunk."""
-    itemsize, chunk = np.dtype(array.dtype).itemsize, array.chunks
-    size, held = math.prod(shape) * itemsize, sum(store.sizes.values())
-    if math.prod(chunk) * itemsize > _LARGEST_CHUNK_BYTES:
-        raise DataError(
-            f"{name}: is stored in chunks of {chunk}, too large to be decoded one at a time; save "
-            "it with smaller chunks"
-        )
-    refuse_growth(size, held, f"{name}: it")
-    stored = array.shards or chunk
+    dtype = np.dtype(array.dtype)
+    refuse_large_chunks(array.chunks, dtype, f"{name}: it")
+    size = math.prod(shape) * dtype.itemsize
+    refuse_growth(size, sum(store.sizes.values()), f"{name}: it")
+    stored = array.shards or array.chunks
     grid = [-(-n // c) for n, c in zip(shape, stored, strict=True)]
     prefix = f"{array.path}/" if array.path else ""
+    # twice a chunk, which a codec may fail to compress, and room for its header
+    most = 2 * math.prod(stored) * dtype.itemsize + 2**16
     if math.prod(grid) > len(store.sizes):
         raise _missing(name, f"it holds {len(store.sizes)} files and needs {math.prod(grid)}")
     for place in itertools.product(*map(range, grid)):
@@ -142,6 +123,11 @@ def _refuse_incomplete(array: Any, shape: tuple[int, ...], store: CheckedStore, 
         frames = f"frames {first} to {min(first + stored[0], shape[0]) - 1}"
         if key not in store.sizes:
             raise _missing(name, f"{key} with {frames} is missing")
+        if store.sizes[key] > most:
+            raise DataError(
+                f"{name}: {key} has {store.sizes[key]} bytes where {most} are the most; it is "
+                "damaged, copy it again or export it again"
+            )
         if array.shards and _lacks_chunks(array, Path(store.root) / key, place, shape):
             raise _missing(name, f"{key} lacks some of {frames}")
 
@@ -166,7 +152,8 @@ def _lacks_chunks(array: Any, path: Path, place: tuple[int, ...], shape: tuple[i
     if len(index) < 16 * count:
         return True
     order = ">" if getattr(codec.index_codecs[0].endian, "value", "little") == "big" else "<"
-    written = np.frombuffer(index, f"{order}u8").reshape(*inside, 2)[..., 0] != _NOTHING
+    nothing = 2**64 - 1  # of a chunk that was not written
+    written = np.frombuffer(index, f"{order}u8").reshape(*inside, 2)[..., 0] != nothing
     starts = [p * s for p, s in zip(place, array.shards, strict=True)]
     needed = tuple(
         slice(0, -(-(min(start + s, n) - start) // c))
@@ -208,7 +195,7 @@ def _of_group(group: Any, name: str) -> tuple[Any, StackMetadata]:
         array = group[finest["path"]]
         axes = [axis if isinstance(axis, Mapping) else {"name": axis} for axis in image["axes"]]
         return array, _scale(axes, finest, array.shape, name)
-    found = dict(_arrays(group))
+    found = {path: array for path, array in group.arrays() if len(array.shape) >= 3}
     if len(found) != 1:
         held = ", ".join(f"/{path}" for path in list(found)[:5]) or "none"
         raise DataError(
@@ -216,12 +203,6 @@ def _of_group(group: Any, name: str) -> tuple[Any, StackMetadata]:
             f'"{name}{MARK}/movie"; it holds: {held}'
         )
     return next(iter(found.values())), StackMetadata()
-
-
-def _arrays(group: Any) -> Iterator[tuple[str, Any]]:
-    for path, array in group.arrays():
-        if len(array.shape) >= 3:
-            yield path, array
 
 
 def _scale(

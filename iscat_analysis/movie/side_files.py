@@ -124,11 +124,11 @@ def _is_called(key: str, name: str) -> bool:
 def _only(values: Mapping[str, object], name: str) -> float | None:
     """Give the number of the one device that has a name, in all frames alike."""
     devices = {key.removesuffix(name).rpartition("/")[2] for key in values}
-    numbers = {number for value in values.values() if (number := _number(value)) is not None}
+    numbers = {number for value in values.values() if (number := number_in(value)) is not None}
     return numbers.pop() if len(devices) == len(numbers) == 1 else None
 
 
-def _number(value: object) -> float | None:
+def number_in(value: object) -> float | None:
     """Read a number above zero, as of ``2``, ``"2x2"`` or ``{"PropVal": "2"}``."""
     if isinstance(value, dict):
         value = value.get("PropVal")
@@ -154,7 +154,6 @@ def inverse(value: float | None) -> float | None:
 _ENDS = (".json", ".txt", ".dat", ".pfs", "_settings.dat", "_metadata.txt")
 _LINE = re.compile(r"\s*([^\t:=#]+?|cam/[^\t]+?)\s*[\t:=]\s*(\S.*?)\s*")
 _MOST_NAMES = 20_000  # of all frames of a long movie
-_LONGEST_LINE = 400
 
 
 def with_side_files(metadata: StackMetadata, movie: Path) -> StackMetadata:
@@ -192,7 +191,7 @@ def _read(path: Path) -> StackMetadata:
             return told_by(dict(_flat(json_of(text))))
     except (OSError, ValueError):
         return StackMetadata()
-    lines = (line for line in text.splitlines() if len(line) <= _LONGEST_LINE)
+    lines = (line for line in text.splitlines() if len(line) <= 400)
     pairs = (match.groups() for line in lines if (match := _LINE.fullmatch(line)))
     return told_by({key: value for (key, value), _ in zip(pairs, range(_MOST_NAMES), strict=False)})
 

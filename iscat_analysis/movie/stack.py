@@ -5,11 +5,10 @@ Frames that a file stores several together, in chunks or shards: none is decoded
 Whoever reads a few frames decodes all that are stored with them; the next ones are then at hand.
 Several threads may read: one decodes a slab, the others wait for it.
 
-One of several channels whose frames take turns in a movie.
-
 Frames of a movie that another one is made of: some of them, or all with other counts.
 
-A movie in several files: TIFF, as Micro-Manager writes it beyond 4 GB and OME describes it.
+Frames that lie in several files, as Micro-Manager writes TIFF beyond 4 GB, or that take turns with
+those of other channels.
 """
 
 from __future__ import annotations
@@ -17,11 +16,10 @@ from __future__ import annotations
 import hashlib
 import math
 import platform
-import threading
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar, runtime_checkable
@@ -31,6 +29,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.hashing import fingerprint, refuse_changed, sha256_of_files, states_of
+from iscat_analysis.last_used import memoize
 from iscat_analysis.movie.addresses import MARK, split_address
 from iscat_analysis.records import (
     BoolArray,
@@ -44,65 +43,31 @@ from iscat_analysis.text import printable
 from iscat_analysis.threads import start_in_thread
 
 _KEPT_BYTES = 2**28  # of decoded frames that are kept
-_FEWEST = 2  # slabs: one thread ends in one while another begins in the next
+
+Read = Callable[[int, int], NDArray[Any]]
+"""Reads frames ``[start, stop)`` as a new array (t, y, x)."""
 
 
-class Slabs:
-    """Reads frames through slabs of `depth` frames, of which some are kept."""
+def in_slabs(read: Read, shape: tuple[int, ...], dtype: np.dtype[Any], depth: int) -> Read:
+    """Read frames through slabs of `depth` frames, of which some are kept."""
+    depth = min(depth, shape[0])
+    kept = _KEPT_BYTES // max(depth * math.prod(shape[1:]) * dtype.itemsize, 1)
+    if depth < 2 or kept < 2:  # one thread ends in a slab while another begins in the next
+        return read
+    slab = memoize(kept, lambda begin: read(begin, min(begin + depth, shape[0])))
 
-    def __init__(
-        self,
-        read: Callable[[int, int], NDArray[Any]],
-        shape: tuple[int, ...],
-        dtype: np.dtype[Any],
-        depth: int,
-    ) -> None:
-        self._read, self._shape, self._dtype = read, shape, dtype
-        self._depth = min(depth, shape[0])
-        slab_bytes = self._depth * math.prod(shape[1:]) * dtype.itemsize
-        kept = _KEPT_BYTES // max(slab_bytes, 1) if self._depth > 1 else 0
-        self._most = kept if kept >= _FEWEST else 0
-        self._kept: OrderedDict[int, Future[NDArray[Any]]] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Read frames ``[start, stop)`` as a new array."""
-        if not self._most:
-            return self._read(start, stop)
-        out = np.empty((stop - start, *self._shape[1:]), dtype=self._dtype)
-        for number in range(start // self._depth, -(-stop // self._depth)):
-            begin = number * self._depth
-            end = min(begin + self._depth, self._shape[0])
-            low, high = max(begin, start), min(end, stop)
-            slab = self._slab(number, begin, end)
-            out[low - start : high - start] = slab[low - begin : high - begin]
+    def read_slabs(start: int, stop: int) -> NDArray[Any]:
+        out = np.empty((stop - start, *shape[1:]), dtype=dtype)
+        for begin in range(start // depth * depth, stop, depth):
+            low, high = max(begin, start), min(begin + depth, stop)
+            out[low - start : high - start] = slab(begin)[low - begin : high - begin]
         return out
 
-    def _slab(self, number: int, begin: int, end: int) -> NDArray[Any]:
-        with self._lock:
-            found = self._kept.get(number)
-            mine = found is None
-            if found is None:
-                found = self._kept[number] = Future()
-            self._kept.move_to_end(number)
-            while len(self._kept) > self._most:
-                self._kept.popitem(last=False)
-        if mine:
-            try:
-                found.set_result(self._read(begin, end))
-            except BaseException as error:
-                with self._lock:
-                    self._kept.pop(number, None)
-                found.set_exception(error)
-                raise
-        return found.result()
+    return read_slabs
 
 
 LeftOut = tuple[BoolArray, NDArray[Any]]
 """Pixels that are left out (y, x), and the counts of each in the dark."""
-
-_MB = 1_000_000
-_FLOAT_BYTES = (4, 8)  # that kernels are compiled for
 
 
 class Frames(Protocol):
@@ -164,14 +129,8 @@ class ArrayFrames:
         self.shape = (shape[0], shape[1], shape[2])
         self.dtype = stored.newbyteorder("=")
         self.metadata, self.notes = metadata, notes
-        self._slabs = Slabs(self._decoded, self.shape, self.dtype, getattr(array, "depth", 1))
-
-    def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Read frames.
-
-        Shapes: result (stop − start, y, x).
-        """
-        return self._slabs.read(start, stop)
+        depth = getattr(array, "depth", 1)
+        self.read = in_slabs(self._decoded, self.shape, self.dtype, depth)
 
     def _decoded(self, start: int, stop: int) -> NDArray[Any]:
         return np.array(self._array[start:stop], dtype=self.dtype, order="C")
@@ -253,7 +212,7 @@ class Stack:
         self._own = True
         self._left_out: LeftOut | None = None
         self._hashing: Future[str] | None = None
-        if self.dtype.kind == "f" and self.dtype.itemsize not in _FLOAT_BYTES:
+        if self.dtype.kind == "f" and self.dtype.itemsize not in (4, 8):  # of compiled kernels
             raise DataError(
                 f"{path}: its pixels are {self.dtype}; export it as integers or 32-bit floats"
             )
@@ -336,7 +295,7 @@ class Stack:
             Under the same name.
         """
         seen = self._again(frames)
-        seen._own = False
+        seen._own, seen._left_out = False, None
         return seen
 
     def channel(self, chosen: tuple[int, int] | None) -> Stack:
@@ -359,10 +318,21 @@ class Stack:
         """
         if chosen is None:
             return self
-
-        frames = ChannelFrames(self._frames, self.name, *chosen)
-        seen = self._again(frames, metadata=frames.with_times(self._metadata))
-        seen._own, seen._channel = self._own, chosen
+        (channels, which), total, known = chosen, self.shape[0], self._metadata
+        images = range(which, total, channels)
+        if len(images) < 2:
+            raise DataError(
+                f"{self.name}: has {total} frames, which are too few for channel {which} of "
+                f"{channels}; give another camera.channels"
+            )
+        if known.ticks is not None:  # which count the intervals of the camera
+            own = known.ticks[which::channels]
+            known = replace(known, ticks=tuple(tick - own[0] for tick in own))
+        elif known.frame_rate_hz is not None:
+            known = replace(known, frame_rate_hz=known.frame_rate_hz / channels)
+        where = np.array([(0, image) for image in images])
+        seen = self._again(FileSet([self._frames], self._files, where, known, self.notes))
+        seen._metadata, seen._channel = known, chosen
         return seen
 
     def without(self, pixels: BoolArray, dark: NDArray[Any]) -> Stack:
@@ -381,7 +351,6 @@ class Stack:
             Under the same name; it reads from the same file.
         """
         seen = self._again(self._frames)
-        seen._own, seen._channel = self._own, self._channel
         if self._left_out is not None:  # some are left out already
             known = np.zeros(pixels.shape, dtype=dark.dtype)
             for mask, values in ((pixels, dark), self._left_out):
@@ -391,11 +360,10 @@ class Stack:
         seen._left_out = pixels, dark
         return seen
 
-    def _again(self, frames: Frames, metadata: StackMetadata | None = None) -> Stack:
+    def _again(self, frames: Frames) -> Stack:
         """Give another one of the same file, which is hashed once for both."""
-        metadata = metadata or self._metadata
-        seen = Stack(self._path, frames, part=self._part, files=self._files, metadata=metadata)
-        seen._hashing, seen._states = self._hashing, self._states
+        seen = Stack.__new__(Stack)
+        vars(seen).update(vars(self), _frames=frames, _closed=False)
         return seen
 
     def close(self) -> None:
@@ -489,7 +457,7 @@ class Stack:
         end = self.shape[0] if stop is None else stop
         self._require(start, end)
         _, y, x = self.shape
-        step = max(1, int(memory_mb * _MB // (y * x * self.dtype.itemsize)))
+        step = max(1, int(memory_mb * 1e6 // (y * x * self.dtype.itemsize)))
         for first in range(start, end, step):
             yield first, self.read(first, min(first + step, end))
 
@@ -539,49 +507,6 @@ class Stack:
                 f"{self._path}: frames [{start}, {stop}) were asked for, but it holds "
                 f"[0, {total}); choose frames inside that range"
             )
-
-
-class ChannelFrames:
-    """Every n-th frame of a movie; `Stack.channel` makes it."""
-
-    def __init__(self, source: Frames, name: str, channels: int, which: int) -> None:
-        self._source, self._channels, self._which = source, channels, which
-        frames = len(range(which, source.shape[0], channels))
-        if frames < 2:
-            raise DataError(
-                f"{name}: has {source.shape[0]} frames, which are too few for channel {which} of "
-                f"{channels}; give another camera.channels"
-            )
-        self.shape = (frames, *source.shape[1:])
-        self.dtype: np.dtype[Any] = source.dtype
-        self.notes = source.notes
-
-    @property
-    def metadata(self) -> StackMetadata:
-        """What the file says, with the times of these frames."""
-        return self.with_times(self._source.metadata)
-
-    def with_times(self, said: StackMetadata) -> StackMetadata:
-        """Give metadata of the whole movie the times of these frames."""
-        if said.ticks is not None:  # which count the intervals of the camera
-            own = said.ticks[self._which :: self._channels]
-            return replace(said, ticks=tuple(tick - own[0] for tick in own))
-        rate = said.frame_rate_hz
-        return replace(said, frame_rate_hz=None if rate is None else rate / self._channels)
-
-    def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Read frames.
-
-        Shapes: result (stop − start, y, x).
-        """
-        if start >= stop:
-            return self._source.read(0, 0)
-        first, last = (self._which + self._channels * n for n in (start, stop - 1))
-        return np.ascontiguousarray(self._source.read(first, last + 1)[:: self._channels])
-
-    def close(self) -> None:
-        """Release the file."""
-        self._source.close()
 
 
 S = TypeVar("S", bound=FrameSource)
@@ -648,7 +573,7 @@ class StackFrames(SelectedFrames[Stack], ChangedFrames):
 
 
 class FileSet:
-    """The frames of a set of files."""
+    """Frames that lie in some files: `where` has the file and the image of each, shape (t, 2)."""
 
     def __init__(
         self,
@@ -667,24 +592,27 @@ class FileSet:
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames ``[start, stop)`` as a new array in native byte order [counts]."""
         block = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
-        where = self._where[start:stop]
-        goes_on = (np.diff(where, axis=0) == [0, 1]).all(axis=1)
-        runs = np.flatnonzero(~goes_on) + 1
-        for first, last in zip([0, *runs], [*runs, len(where)], strict=True):
-            if last > first:
-                member, image = where[first]
-                block[first:last] = self._members[member].read(image, image + last - first)
+        for first, last in self._runs(start, stop):
+            member, image = self._where[first].tolist()
+            block[first - start : last - start] = self._members[member].read(
+                image, image + last - first
+            )
         return block
+
+    def _runs(self, start: int, stop: int) -> list[tuple[int, int]]:
+        """Divide frames into those that follow one another in a file."""
+        goes_on = (np.diff(self._where[start:stop], axis=0) == [0, 1]).all(axis=1)
+        edges = [start, *(np.flatnonzero(~goes_on) + start + 1).tolist(), stop]
+        return list(pairwise(edges)) if stop > start else []
 
     def in_place(self, start: int, stop: int) -> InPlace | None:
         """Give frames where they lie, if one file holds all of them in a row."""
-        where = self._where[start:stop]
-        if not len(where) or not (np.diff(where, axis=0) == [0, 1]).all():
+        if len(self._runs(start, stop)) != 1:
             return None
-        member, image = self._members[int(where[0, 0])], int(where[0, 1])
-        if not isinstance(member, PlacedSource):
-            return None
-        return member.in_place(image, image + stop - start)
+        number, image = self._where[start].tolist()
+        member = self._members[number]
+        placed = isinstance(member, PlacedSource)
+        return member.in_place(image, image + stop - start) if placed else None
 
     def close(self) -> None:
         """Release the files."""

@@ -23,7 +23,6 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -47,6 +46,7 @@ from iscat_analysis.movie.descriptions import (
     time_axis,
 )
 from iscat_analysis.movie.mapped import (
+    MOST_FRAME_DECODED_RATIO,
     WHAT_LIBRARIES_RAISE,
     damaged,
     frames_in_place,
@@ -56,8 +56,8 @@ from iscat_analysis.movie.mapped import (
     release,
     unmap,
 )
-from iscat_analysis.movie.ome import OmeSet, is_ome, read_ome, read_ome_set
-from iscat_analysis.movie.stack import FileSet, Frames
+from iscat_analysis.movie.ome import OmeMovie, is_ome, read_ome
+from iscat_analysis.movie.stack import FileSet
 from iscat_analysis.records import InPlace, StackMetadata
 
 STRIP_OFFSETS, TILE_OFFSETS, STRIP_SIZES, TILE_SIZES = 273, 324, 279, 325
@@ -65,13 +65,6 @@ STRIP_OFFSETS, TILE_OFFSETS, STRIP_SIZES, TILE_SIZES = 273, 324, 279, 325
 
 _LOSSLESS = {1, 5, 8, 32773, 32946, 34925, 50000}
 """No compression, LZW, Deflate, PackBits, old Deflate, LZMA, Zstandard."""
-
-_LARGEST_FRAME_BYTES = 2**31  # 32 768 × 32 768 pixels of 16 bits, beyond any camera
-MOST_FRAME_DECODED_RATIO = 100
-"""Of one frame, which is held in memory whole, decoded over stored."""
-
-_OVERLAP = 2  # values of tags over the size of the file; each lies in it once
-_OVERLAP_BYTES = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,17 +89,11 @@ class Image:
         return f"{' x '.join(map(str, self.shape))} pixels of {self.dtype}"
 
 
-def refuse_overlap(values: int, data: mmap.mmap, path: Path) -> None:
-    """Refuse images that share one long value, which would cost its length each time."""
-    if values > _OVERLAP * len(data) + _OVERLAP_BYTES:
-        raise _damaged(path, "the headers of its images overlap")
-
-
 def refuse_unread_pixels(page: tifffile.TiffPage, file_size: int, path: Path) -> None:
     """Refuse an image whose strips or tiles are not all listed, and whole, in the file."""
     number, rows, columns = page.index, page.imagelength, page.imagewidth
     frame_bytes = rows * columns * (page.dtype.itemsize if page.dtype else 8) * page.samplesperpixel
-    if not 0 < frame_bytes <= _LARGEST_FRAME_BYTES:
+    if not 0 < frame_bytes <= 2**31:  # 32 768 × 32 768 pixels of 16 bits, beyond any camera
         raise _damaged(path, f"image {number} declares {rows} x {columns} pixels")
     needed = math.prod(page.chunked)
     tag = page.tags.get(TILE_OFFSETS) or page.tags.get(STRIP_OFFSETS)
@@ -133,15 +120,6 @@ def refuse_unread_pixels(page: tifffile.TiffPage, file_size: int, path: Path) ->
             rows, columns = needed * tile_rows, tile_columns
         if stored < rows * -(-columns * page.bitspersample // 8):
             raise _damaged(path, f"image {number} needs more than the {stored} bytes it stores")
-
-
-def refuse_volumes(page: tifffile.TiffPage, path: Path) -> None:
-    """Refuse images of several planes, which descriptions may count one by one."""
-    if page.imagedepth > 1:
-        raise DataError(
-            f"{path}: holds volumes ({page.imagedepth} planes per image); "
-            "export one plane per frame"
-        )
 
 
 def pixel_type(page: tifffile.TiffPage, path: Path) -> np.dtype[Any]:
@@ -184,7 +162,6 @@ def _damaged(path: Path, how: str) -> DataError:
     return DataError(f"{path}: is damaged ({how}); export it again")
 
 
-STRIP_OFFSETS = 273
 _ELSEWHERE = {282: 5, 283: 5, 305: 2, 306: 2}
 """Resolutions, program and time, with their types: they lie outside the list of tags, and those of
 the first image count."""
@@ -250,8 +227,6 @@ _ESSENTIAL = {
     TILE_OFFSETS, TILE_SIZES, 339, 32997, _METAMORPH_PLANES,
 }  # fmt: skip
 """Tags without which an image would be taken for another: size, type, encoding, place, text."""
-
-_INLINE = 8  # elements that may stand in the list of tags itself
 
 _PLAIN = dict.fromkeys(("is_lsm", "is_ndpi", "is_ome", "is_scanimage", "is_stk"), False)
 """Dialects whose images tifffile would guess rather than read."""
@@ -349,7 +324,7 @@ def open_tiff(path: Path, *, member: bool = False) -> TiffFrames | FileSet:
     data = map_file(path)
     try:
         what = f"{path}: is truncated or damaged ({len(data)} bytes long)"
-        with damaged(what), _unheard(), tifffile.TiffFile(path, **_PLAIN) as file:
+        with damaged(what), _tiff(path) as file:
             return _open(file, data, path, member)
     except DataError:
         data.close()
@@ -369,10 +344,9 @@ def open_frame_file(path: Path) -> Iterator[TiffFrames]:
 def is_single_image(path: Path) -> bool:
     """Tell whether a file holds one image, and describes no set of files."""
     try:
-        with _unheard(), tifffile.TiffFile(path, **_PLAIN) as file:
+        with _tiff(path) as file:
             page = file.pages[0]
-            texts = [_text(tag.value) for tag in page.tags.getall(_DESCRIPTION, ())]
-            joined = any(is_ome(text) and "FileName" in text for text in texts)
+            joined = any(is_ome(text) and "FileName" in text for text in _texts(page))
             return len(file.pages) == 1 and _planes(page) == 1 and not joined
     except WHAT_LIBRARIES_RAISE:  # whoever opens it says what is wrong with it
         return False
@@ -380,26 +354,29 @@ def is_single_image(path: Path) -> bool:
 
 def first_texts(path: Path) -> tuple[str, ...]:
     """Read the descriptions of the first image alone."""
-    with _unheard(), tifffile.TiffFile(path, **_PLAIN) as file:
-        return tuple(_text(tag.value) for tag in file.pages[0].tags.getall(_DESCRIPTION, ()))
+    with _tiff(path) as file:
+        return _texts(file.pages[0])
 
 
 def _open(
     file: tifffile.TiffFile, data: mmap.mmap, path: Path, member: bool
 ) -> TiffFrames | FileSet:
     images = list(_images(file, data, path))
-    refuse_volumes(file.pages[0], path)
-    texts = images[0].texts
+    depth, texts = file.pages[0].imagedepth, images[0].texts
+    if depth > 1:  # which descriptions may count one by one
+        raise DataError(
+            f"{path}: holds volumes ({depth} planes per image); export one plane per frame"
+        )
     ome_text = next((text for text in texts if is_ome(text)), None)
     notes: tuple[str, ...] = ()
     if member:
         order, n_frames, hints = list(range(len(images))), len(images), []
-    elif ome_text is not None and (several := read_ome_set(ome_text, path)) is not None:
-        data.close()
-        return open_set(several, path, partial(open_tiff, member=True))
     elif ome_text is not None:
         ome = read_ome(ome_text, len(images), path)
-        order = ome.order.tolist()
+        if len(ome.files) > 1:
+            data.close()
+            return _open_set(ome, path)
+        order = ome.where[:, 1].tolist()
         n_frames, hints = len(order), [ome.hints]
     else:
         # Thumbnails are left out, unless everything is declared to be one.
@@ -411,7 +388,12 @@ def _open(
     frames = [images[k] for k in order]
     if not member and (found := order_by_time(frames)) is not None:
         frames, order = [frames[k] for k in found], [order[k] for k in found]
-        notes = (*notes, out_of_order(found))
+        moved = sum(page != frame for frame, page in enumerate(found))
+        notes = (
+            *notes,
+            f"{moved} of the file's {len(found)} images are not where their times (ElapsedTime-ms, "
+            "or else FrameIndex) say; the frames are read in the order of these times",
+        )
     first = file.pages[order[0]]
     dtype = pixel_type(first, path).newbyteorder(file.byteorder)
     refuse_differences(frames, path)
@@ -447,13 +429,14 @@ def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[Im
     pattern: Repetition | None = None
     for number in itertools.count():
         again = None
+        if values > 2 * len(data) + 1_000_000:  # one long value would cost its length each time
+            raise _damaged(path, "the headers of its images overlap")
         if pattern is not None and following not in seen:
             again = pattern.find(data, following)
         if again is not None and image is not None:
             seen.add(following)
             start, following = again
             values += long_values
-            refuse_overlap(values, data, path)
             yield replace(image, offsets=(start,), start=None if image.start is None else start)
             continue
         if number and not following:
@@ -468,16 +451,16 @@ def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[Im
         tags, following = _declared_tags(file.tiff, data, page.offset)
         if len(tags) != len(page.tags) and set(tags) & _ESSENTIAL - set(page.tags.keys()):
             raise _damaged(path, f"the header of image {number} is truncated or cannot be read")
-        long_values = sum(tag.valuebytecount for tag in page.tags if tag.count > _INLINE)
+        # eight elements may stand in the list of tags itself
+        long_values = sum(tag.valuebytecount for tag in page.tags if tag.count > 8)
         values += long_values
-        refuse_overlap(values, data, path)
         refuse_unread_pixels(page, len(data), path)
         image = Image(
             page.shape,
             page.dtype,
             page.hash,
             page.is_reduced,
-            tuple(_text(tag.value) for tag in page.tags.getall(_DESCRIPTION, ())),
+            _texts(page),
             page.dataoffsets,
             page.databytecounts,
             _start(page),
@@ -509,10 +492,11 @@ def _declared_tags(
     return codes, int(struct.unpack_from(tiff.offsetformat, data, end)[0])
 
 
-def _text(value: str | bytes) -> str:
-    """Text of a description, which tifffile gives as bytes where it is not UTF-8."""
-    text = value if isinstance(value, str) else value.decode("latin-1")
-    return text.partition("\0")[0].strip()
+def _texts(page: tifffile.TiffPage) -> tuple[str, ...]:
+    """Give the descriptions of an image, which tifffile gives as bytes where they are not UTF-8."""
+    values = [tag.value for tag in page.tags.getall(_DESCRIPTION, ())]
+    texts = (text if isinstance(text, str) else text.decode("latin-1") for text in values)
+    return tuple(text.partition("\0")[0].strip() for text in texts)
 
 
 def _count_frames(images: Sequence[Image], path: Path) -> tuple[int, bool]:
@@ -585,23 +569,24 @@ def _resolution(page: tifffile.TiffPage) -> tuple[float, float, int] | None:
 
 
 @contextmanager
-def _unheard() -> Iterator[None]:
-    """Keep log messages of tifffile off stderr, unless the program has set up logging."""
+def _tiff(path: Path) -> Iterator[tifffile.TiffFile]:
+    """Open a file; log messages are kept off stderr, unless the program has set up logging."""
     logger, handler = logging.getLogger("tifffile"), logging.NullHandler()
     logger.addHandler(handler)
     try:
-        yield
+        with tifffile.TiffFile(path, **_PLAIN) as file:
+            yield file
     finally:
         logger.removeHandler(handler)
 
 
-def open_set(described: OmeSet, path: Path, open_member: Callable[[Path], Frames]) -> FileSet:
+def _open_set(described: OmeMovie, path: Path) -> FileSet:
     """Open the files of a set, which lie beside each other."""
     files = [path.with_name(name) if name else path for name in described.files]
     with ExitStack() as opened:
         members = []
         for file in files:
-            members.append(open_member(file))
+            members.append(open_tiff(file, member=True))
             opened.callback(members[-1].close)
         last = np.full(len(files), -1)
         np.maximum.at(last, described.where[:, 0], described.where[:, 1])
@@ -629,12 +614,3 @@ def order_by_time(images: Sequence[Image]) -> list[int] | None:
     order = np.lexsort(keys[::-1]) if keys else np.arange(len(images))
     found: list[int] = order.tolist()
     return None if found == [*range(len(images))] else found
-
-
-def out_of_order(order: Sequence[int]) -> str:
-    """Say that frames were sorted."""
-    moved = sum(page != frame for frame, page in enumerate(order))
-    return (
-        f"{moved} of the file's {len(order)} images are not where their times (ElapsedTime-ms, or "
-        "else FrameIndex) say; the frames are read in the order of these times"
-    )

@@ -27,12 +27,7 @@ from iscat_analysis.answers.calibrations import read_contrasts
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import datasets as refeyn_module
 from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.event_tables import (
-    TABLE_COLUMNS,
-    StoredCalibration,
-    read_events,
-    stored_calibration,
-)
+from iscat_analysis.movie.event_tables import TABLE_COLUMNS, read_events
 
 ENCODED = {"differences": True, "encoding": "TIME_DIFFERENCE"}
 
@@ -219,34 +214,6 @@ def test_every_dialect_of_events(tmp_path: Path, dialect: str) -> None:
     for column, name in zip(TABLE_COLUMNS, EVENTS, strict=False):
         np.testing.assert_array_equal(table[column], EVENTS[name])
     np.testing.assert_allclose(table["mass_kda"], masses(), rtol=1e-14)
-    calibration = stored_calibration(table)
-    if dialect == "csv":
-        assert calibration is None
-        return
-    assert calibration is not None
-    assert (calibration.gradient_per_kda, calibration.offset) == CALIBRATION
-    if dialect == "2021":
-        assert calibration.standard_masses_kda == (66.0, 480.0)
-
-
-def test_the_calibration_is_odd() -> None:
-    calibration = StoredCalibration(*CALIBRATION)
-    contrast = np.linspace(-0.1, 0.1, 41)
-    mass = calibration.mass_kda(contrast)
-    np.testing.assert_array_equal(mass, -calibration.mass_kda(-contrast))
-    slope, offset = CALIBRATION
-    away = np.abs(contrast) > 2 * offset
-    np.testing.assert_allclose((slope * mass + np.sign(mass) * offset)[away], contrast[away])
-
-
-def test_a_table_survives_parquet_with_its_calibration(tmp_path: Path) -> None:
-    import pandas as pd
-
-    table = read_events(write_events(tmp_path / "events.h5", "2021"))
-    table.to_parquet(tmp_path / "events.parquet")
-    again = pd.read_parquet(tmp_path / "events.parquet")
-    pd.testing.assert_frame_equal(again, table)
-    assert stored_calibration(again) == stored_calibration(table)
 
 
 def test_missing_values_are_nan(tmp_path: Path) -> None:
@@ -278,12 +245,10 @@ def test_the_events_of_several_movies_are_together_or_one_by_one(tmp_path: Path)
     np.testing.assert_allclose(table["mass_kda"], [*masses(), *(twice / slope)], rtol=1e-14)
     assert table["frame"].isna().all()  # each movie counts from 0
     assert "events of 2 movies are taken together" in table.attrs["notes"][0]
-    assert stored_calibration(table) is None  # of two that differ
     for part, expected in (("b", twice), ("per_movie_events/0", EVENTS["contrasts"])):
         one = read_events(Path(f"{path}::{part}"))
         np.testing.assert_array_equal(one["contrast"], expected)
         assert one["frame"].tolist() == EVENTS["frame_indices"].tolist()
-        assert stored_calibration(one) is not None
     np.testing.assert_array_equal(read_contrasts(Path(f"{path}::b"))["contrast"], twice)
     (tmp_path / "series.csv").write_text("path,concentration_nm\nevents.h5::b,3\n")
     with pytest.raises(DataError, match=r"events\.h5::b: holds 4 events, too few"):
@@ -310,10 +275,3 @@ def test_the_measured_table_is_reproduced_to_the_last_bit(data_dir: Path) -> Non
     table = read_events(path)
     assert len(table) == 2069
     assert (table["mass_kda"] < 0).sum() == 641
-    calibration = stored_calibration(table)
-    assert calibration is not None
-    contrast = table["contrast"].to_numpy()
-    np.testing.assert_array_equal(calibration.mass_kda(contrast), table["mass_kda"])
-    line = (contrast - calibration.offset) / calibration.gradient_per_kda
-    error = np.abs(line - table["mass_kda"])[contrast > 0]
-    np.testing.assert_allclose(error, 2 * abs(calibration.offset / calibration.gradient_per_kda))
