@@ -68,16 +68,9 @@ class Executor:
     distant = False
     """Whether jobs run in other processes, which read movies by their paths."""
 
-    def call(
-        self,
-        job: Callable[..., R],
-        /,
-        *arguments: Any,
-        progress: Progress = silent,
-        here: Callable[[], R] | None = None,
-    ) -> R:
-        """Do a job and wait for it; `here` does the same with what this process holds already."""
-        return here() if here is not None else job(*arguments, progress=progress)
+    def call(self, job: Callable[..., R], /, *arguments: Any, progress: Progress = silent) -> R:
+        """Do a job and wait for it."""
+        return job(*arguments, progress=progress)
 
     def each(self, work: Callable[[T], R], items: Sequence[T]) -> Generator[tuple[int, R]]:
         """Apply a function to every item, in parallel where jobs run elsewhere."""
@@ -136,18 +129,11 @@ class DaskExecutor(Executor):
             )
         return shown
 
-    def call(
-        self,
-        job: Callable[..., R],
-        /,
-        *arguments: Any,
-        progress: Progress = silent,
-        here: Callable[[], R] | None = None,
-    ) -> R:
+    def call(self, job: Callable[..., R], /, *arguments: Any, progress: Progress = silent) -> R:
         """Do a job on a worker; see `Executor`."""
         from distributed import KilledWorker
 
-        del progress, here
+        del progress
         sent = pickle.dumps((job, arguments))
         name = job.__name__.strip("_")
         with self._lock:

@@ -30,31 +30,19 @@ from iscat_analysis.diagnosis import (
 )
 from iscat_analysis.errors import FloodError
 from iscat_analysis.findings import Finding
+from iscat_analysis.findings import particles as of
 from iscat_analysis.findings.camera import MODEL_MISFITS
-from iscat_analysis.findings.particles import (
-    BRIGHTNESS_JUMPS,
-    COMMON_HEIGHT_UNKNOWN,
-    FRAMES_LEFT_OUT,
-    HEIGHTS_LEARNED,
-    HEIGHTS_NOT_LEARNED,
-    PARTLY_SEARCHED,
-    PATTERN_FOLLOWED,
-    PATTERN_MOVED,
-    PATTERN_NOT_FOLLOWED,
-    POWER_ALWAYS_FOLLOWED,
-)
 from iscat_analysis.fitting.events import index_finding
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.inference.heights import spread_of_heights
-from iscat_analysis.landing.chunks import ChunkNode, ChunkRunner, ChunkStore
-from iscat_analysis.landing.merging import MergedChunks
+from iscat_analysis.landing.chunks import ChunkNode, ChunkRunner, ChunkStore, MergedChunks
 from iscat_analysis.medians import robust_sigma
 from iscat_analysis.records import CountSource, FloatArray, Status, counted
 from iscat_analysis.search.sliding import boundaries, stride_of
 from iscat_analysis.threads import start_in_thread
-from iscat_analysis.units import listed
+from iscat_analysis.units import are, frames_listed, listed
 
 JUMP = 0.1
 """Relative change of the light from one frame to the next that is reported."""
@@ -101,12 +89,12 @@ def with_learned_heights(ready: Prepared, run: Run) -> Config:
     prior_sd_nm = particle.height_prior_sd_nm
     if spread is None or spread.mean_se_nm > prior_sd_nm / 2:
         prior = {"height_nm": particle.nominal_height_nm, "sd_nm": prior_sd_nm}
-        run.report(HEIGHTS_NOT_LEARNED(prior))
+        run.report(of.HEIGHTS_NOT_LEARNED(prior))
         return config
-    run.report(HEIGHTS_LEARNED({"spread": str(spread), "particles": spread.events}, where=name))
+    run.report(of.HEIGHTS_LEARNED({"spread": str(spread), "particles": spread.events}, where=name))
     if ready.summary.get("optics", {}).get("calibrated"):
         values = {"sd_nm": spread.sd_nm, "mean_nm": spread.mean_nm}
-        run.report(COMMON_HEIGHT_UNKNOWN(values))
+        run.report(of.COMMON_HEIGHT_UNKNOWN(values))
     learned = {
         "learned_height_nm": max(round(spread.mean_nm, 2), 0.0),
         # Least spread that is learned: with none the height would be held again.
@@ -225,14 +213,14 @@ def landing_findings(
         spans = sorted(summary["partly_searched"], key=lambda span: span[2])[:3]
         worst = ", ".join(f"{start}:{stop} ({part:.0%})" for start, stop, part in sorted(spans))
         values = {"share": share, "snr": summary["searched_snr"], "frames": worst}
-        yield PARTLY_SEARCHED(values, where=name)
+        yield of.PARTLY_SEARCHED(values, where=name)
     if config.fit.index:
         missing = int(found.fits["refractive_index"].isna().sum())
         yield index_finding(found.context, merged.untold, missing, len(found.fits), where=name)
     if merged.cause:
         yield MODEL_MISFITS({"cause": merged.cause}, where=name)
     if not config.background.power_normalization:
-        yield POWER_ALWAYS_FOLLOWED()
+        yield of.POWER_ALWAYS_FOLLOWED()
 
 
 def frame_findings(
@@ -244,21 +232,17 @@ def frame_findings(
     """
     if missing.size:
         share = missing.size / light.size
-        lost = f"; {share:.0%} of the movie, with what lands there, is lost"
-        values = {
-            "frames": _frames(missing),
-            "verb": "is" if missing.size == 1 else "are",
-            "lost": lost if share > LOST else "",
-            "number": missing.size,
-        }
-        yield FRAMES_LEFT_OUT(values, where=name)
+        values = {"frames": frames_listed(missing), "verb": are(missing.size), "lost": ""}
+        if share > LOST:
+            values["lost"] = f"; {share:.0%} of the movie, with what lands there, is lost"
+        yield of.FRAMES_LEFT_OUT({**values, "number": missing.size}, where=name)
     known = np.flatnonzero(np.isfinite(light))
     change = light[known][1:] / light[known][:-1] - 1
     usual = robust_sigma(change) if change.size else 0.0
     jumps = known[1:][np.abs(change) > max(JUMP, 8 * usual)] + first
     if jumps.size:
         largest = 100 * float(change[np.argmax(np.abs(change))])
-        yield BRIGHTNESS_JUMPS({"frames": _frames(jumps), "percent": largest}, where=name)
+        yield of.BRIGHTNESS_JUMPS({"frames": frames_listed(jumps), "percent": largest}, where=name)
 
 
 def drift_findings(
@@ -268,22 +252,13 @@ def drift_findings(
     way, drift = merged.trajectory(), merged.drift()
     moved = {} if drift is None else {"y_px": drift[0], "x_px": drift[1]}
     if way is not None and moved:
-        yield PATTERN_FOLLOWED(moved | {"error_px": way.typical_error_px}, where=name)
+        yield of.PATTERN_FOLLOWED(moved | {"error_px": way.typical_error_px}, where=name)
     unfollowed = merged.unfollowed() if corrected else []
     if unfollowed:
-        spans = ", ".join(f"{a}:{b}" for a, b in unfollowed[:4])
-        more = " and more" if len(unfollowed) > 4 else ""
-        yield PATTERN_NOT_FOLLOWED({"frames": spans + more}, where=name)
-    if (
-        drift is not None
-        and not corrected
-        and math.hypot(*drift) > DRIFT_PX * max(windows / 2, 1.0)
-    ):
-        yield PATTERN_MOVED(moved, where=name)
-
-
-def _frames(frames: NDArray[np.int64]) -> str:
-    return f"frame{'' if frames.size == 1 else 's'} {listed(frames, 4)}"
+        spans = listed((f"{a}:{b}" for a, b in unfollowed), 4)
+        yield of.PATTERN_NOT_FOLLOWED({"frames": spans}, where=name)
+    if drift and not corrected and math.hypot(*drift) > DRIFT_PX * max(windows / 2, 1.0):
+        yield of.PATTERN_MOVED(moved, where=name)
 
 
 def _median_snr(table: pd.DataFrame) -> float:
@@ -294,9 +269,9 @@ def _median_snr(table: pd.DataFrame) -> float:
 
 def _trajectory_summary(trajectory: Trajectory | None) -> dict[str, Any]:
     """Summarise a trajectory of the fixed pattern."""
-    keys = ("drift_frames", "drift_x_px", "drift_y_px", "drift_error_px")
-    values: tuple[Any, ...] = (None,) * 4
+    values: tuple[Any, ...] = (False, None, None, None, None)
     if trajectory is not None:
         y, x = trajectory.shift_px.T.tolist()
-        values = trajectory.frames.tolist(), x, y, trajectory.typical_error_px
-    return {"drift_corrected": trajectory is not None, **dict(zip(keys, values, strict=True))}
+        values = True, trajectory.frames.tolist(), x, y, trajectory.typical_error_px
+    keys = ("drift_corrected", "drift_frames", "drift_x_px", "drift_y_px", "drift_error_px")
+    return dict(zip(keys, values, strict=True))

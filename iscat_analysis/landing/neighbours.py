@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import Any
@@ -218,6 +218,12 @@ class Neighbours:
         ends, whole = self._power[edges[1:]], np.diff(self._power[edges])
         later = (ends - self._power[turned].mean(axis=0)) / np.where(whole > 0, whole, 1.0)
         return np.asarray(later if step.sign > 0 else 1 - later)
+
+    def in_blocks(self, frames: NDArray[np.int64]) -> Iterator[tuple[float, slice]]:
+        """Divide frames as blocks do: the middle of each part, and it relative to the chunk."""
+        for start in range(0, frames.size, self.stride):
+            part = frames[start : start + self.stride]
+            yield float(part.mean()), self.chunk.cut(int(part[0]), int(part[-1]) + 1)
 
     def light_in(self, frames: slice, steps: Iterable[Step]) -> FloatArray:
         """Give the factor by which steps change the light of frames, (y, x)."""

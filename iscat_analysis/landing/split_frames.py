@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -13,9 +12,8 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera import Camera
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.events import Event, Region, photons_scale
+from iscat_analysis.fitting.events import Event, photons_scale
 from iscat_analysis.fitting.field import total_signal
-from iscat_analysis.fitting.pattern import LocalPattern
 from iscat_analysis.inference.repeats import (
     PARTS,
     Response,
@@ -33,12 +31,6 @@ from iscat_analysis.trust.null_field import background_field, empty_field, taken
 
 PLACES, MOVIE_PLACES = 20_000, 100_000
 """Places times windows at which the noise of a chunk is looked at, and of a whole movie."""
-
-MOST_WINDOWS, FEWEST_WINDOWS = 8, 2
-"""Windows of a chunk that are looked at."""
-
-
-_BLOCK_BYTES = 16 * 2**20
 
 
 def nothing_repeated(mode: str) -> FloatArray:
@@ -67,6 +59,7 @@ def step_repeats(
         return nothing_repeated(neighbours.context.mode)
     moving = neighbours.pattern
     local = None if moving is None else moving.local(region, step.at.frame)
+    at = neighbours.shared(step, region)
     whole = chunk.patch(min(spans)[0], max(spans)[1], region.rows, region.columns)
     light = whole.mean_e
     read = np.square(whole.read_noise_e) * np.ones(region.shape)
@@ -94,38 +87,19 @@ def step_repeats(
             height = np.einsum("iyx,yx->i", weights[(slice(None), *here)], light[here] * image)
             there = (frames >= other.at.turns[:, None]).mean(axis=0)
             known += np.outer(other.sign * height, there)
-        if local is not None:
-            known += _moved(step, region, weights, light, frames, local, neighbours)
+        if local is not None:  # the pattern moves, and the particle with it
+            centres, cuts = zip(*neighbours.in_blocks(frames), strict=True)
+            seen = [local.seen(cut) for cut in cuts]
+            for centre, cut, block in zip(centres, cuts, seen, strict=True):
+                if at is not None and (centre + 0.5 >= step.at.frame) == (step.sign > 0):
+                    block[at[0]] += light[at[0]] * neighbours.seen(step, cut, at[1])
+            heights = np.einsum("iyx,kyx->ik", weights, seen)
+            known += [np.interp(frames, centres, height) for height in heights]
         left = replace(one, values=one.values - known * one.power)
         inside = (frames >= window[0]) & (frames < window[1])
         own.append(replace(left, values=left.values[:, inside], power=left.power[inside]))
         longer.append(left)
     return repeats_of(tuple(own), tuple(longer))
-
-
-def _moved(
-    step: Step,
-    region: Region,
-    weights: FloatArray,
-    light: FloatArray,
-    frames: NDArray[np.int64],
-    local: LocalPattern,
-    neighbours: Neighbours,
-) -> FloatArray:
-    """Give what the motion of the pattern, and of the particle, adds to each frame."""
-    stride, shared = neighbours.stride, neighbours.shared(step, region)
-    centres, heights = [], []
-    for start in range(0, frames.size, stride):
-        part = frames[start : start + stride]
-        cut = neighbours.chunk.cut(int(part[0]), int(part[-1]) + 1)
-        seen = local.seen(cut)
-        if shared is not None:
-            here, inside = shared
-            there = (part[len(part) // 2] >= step.at.frame) == (step.sign > 0)
-            seen[here] += there * light[here] * neighbours.seen(step, cut, inside)
-        centres.append(float(part.mean()))
-        heights.append(np.einsum("iyx,yx->i", weights, seen))
-    return np.stack([np.interp(frames, centres, height) for height in np.transpose(heights)])
 
 
 def step_controls(
@@ -182,7 +156,7 @@ def step_controls(
 def most_windows(places: int, share: float) -> int:
     """Give the number of such windows in a chunk, in proportion to its share of the movie."""
     enough = min(PLACES, MOVIE_PLACES * share) / max(places, 1)
-    return int(np.clip(enough, FEWEST_WINDOWS, MOST_WINDOWS))
+    return int(np.clip(enough, 2, 8))
 
 
 def _cuts(chunk: Chunk, start: int, stop: int) -> Iterator[slice]:
@@ -198,13 +172,38 @@ def _cuts(chunk: Chunk, start: int, stop: int) -> Iterator[slice]:
 # ---- background frames -----------------------------------------------------------------------
 
 
-@dataclass
 class _Own:
     """The frames of one event, as they are read."""
 
-    event: Event
-    response: Response
-    sides: tuple[list[Series], list[Series]]
+    def __init__(self, event: Event, camera: Camera) -> None:
+        self._here = event.region.slices
+        self._response, self._camera = _response(event), camera.part(self._here)
+        self._sides: tuple[list[Series], list[Series]] = [], []
+
+    def add(
+        self, side: int, counts: NDArray[Any], power: FloatArray, mean: FloatArray, read: FloatArray
+    ) -> None:
+        """Weigh some frames before or after.
+
+        Shapes: `counts` (t, y, x), `power` (t,), `mean, read` (y, x).
+        """
+        if self._response is not None:
+            one = series_of(
+                counts[(slice(None), *self._here)],
+                (self._response.before, self._response.after)[side],
+                power,
+                gain=self._camera.gain_e_per_adu,
+                offset=self._camera.offset_adu,
+                mean_e=mean[self._here],
+                read_variance_e2=read[self._here],
+            )
+            self._sides[side].append(one)
+
+    def repeats(self, mode: str) -> FloatArray:
+        """Compare the parts."""
+        if self._response is None:
+            return nothing_repeated(mode)
+        return repeats_of(tuple(_joined(side) for side in self._sides if side))
 
 
 def field_repeats(
@@ -219,10 +218,7 @@ def field_repeats(
         return [], None
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
     read = camera.read_variance_e2(shape)
-    owns: list[_Own | None] = []
-    for event in events:
-        response = _response(event)
-        owns.append(None if response is None else _Own(event, response, ([], [])))
+    owns = [_Own(event, camera) for event in events]
     spans = (windows.frames_before, windows.frames_after)
     n_before = windows.n_before
     power = windows.power
@@ -258,11 +254,10 @@ def field_repeats(
             )
         for a, b in pairwise(edges):
             total = np.zeros(shape)
-            for start, stop in _pieces(shape, a, b):
-                counts = movie.read(span[0] + start, span[0] + stop)
+            for first, counts in movie.chunks(span[0] + a, span[0] + b, memory_mb=4.0):
+                start = first - span[0]
                 for own in owns:
-                    if own is not None:
-                        _append(own, side, counts, power[start:stop], mean, read, camera)
+                    own.add(side, counts, power[start : start + len(counts)], mean, read)
                 if field is not None:
                     total += camera.to_electrons(counts).sum(axis=0)
             if field is not None:
@@ -274,39 +269,7 @@ def field_repeats(
         light = np.array(lights[0]), np.array(lights[1])
         left = field.left([(event.candidate.x_px, event.candidate.y_px) for event in events])
         empty = field.spread(parts[0], parts[1], light, taken, left)
-    return [
-        nothing_repeated(context.mode)
-        if own is None
-        else repeats_of(tuple(_joined(side) for side in own.sides if side))
-        for own in owns
-    ], empty
-
-
-def _append(
-    own: _Own,
-    side: int,
-    counts: NDArray[Any],
-    power: FloatArray,
-    mean: FloatArray,
-    read: FloatArray,
-    camera: Camera,
-) -> None:
-    here = own.event.region.slices
-    gain, offset = (
-        v[here] if isinstance(v, np.ndarray) else v
-        for v in (camera.gain_e_per_adu, camera.offset_adu)
-    )
-    own.sides[side].append(
-        series_of(
-            counts[(slice(None), *here)],
-            own.response.after if side else own.response.before,
-            power,
-            gain=gain,
-            offset=offset,
-            mean_e=mean[here],
-            read_variance_e2=read[here],
-        )
-    )
+    return [own.repeats(context.mode) for own in owns], empty
 
 
 def _joined(series: Sequence[Series]) -> Series:
@@ -316,12 +279,6 @@ def _joined(series: Sequence[Series]) -> Series:
         series[0].shot,
         series[0].read,
     )
-
-
-def _pieces(shape: tuple[int, int], start: int, stop: int) -> Iterator[tuple[int, int]]:
-    size = max(1, _BLOCK_BYTES // (8 * math.prod(shape)))
-    for begin in range(start, stop, size):
-        yield begin, min(begin + size, stop)
 
 
 # ---- both ------------------------------------------------------------------------------------

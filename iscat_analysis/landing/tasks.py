@@ -103,12 +103,12 @@ class TaskBuilder:
         if begin < held.first or end > held.first + len(held.counts):
             held = chunk.patch(begin, end, region.rows, region.columns)
         patch = held.frames(begin, end)
-        before, n_before, power_before = patch.window(*first)
-        after, n_after, power_after = patch.window(*second)
+        sums = [patch.window(*frames) for frames in (first, second)]
+        (_, n_before, power_before), (_, n_after, power_after) = sums
         if not n_before or not n_after:
             return None
-        ratio = np.full(before.shape, power_after / power_before)
         cuts = chunk.cut(*first), chunk.cut(*second)
+        ratio = np.full(region.shape, power_after / power_before)
         for other in neighbours:
             self.neighbours.apply(ratio, other, *cuts, region)
         self.neighbours.interfere(ratio, step, neighbours, *cuts, region)
@@ -126,37 +126,34 @@ class TaskBuilder:
                 ratio[here] *= self.neighbours.own_factor(step, *cuts, inside)
             with_it = cuts[1] if step.sign > 0 else cuts[0]
             offset = moving.shift(with_it) - moving.at(at.frame)
-        read = np.square(patch.read_noise_e, dtype=np.float64)  # one number for most cameras
-        variances = [np.broadcast_to(n * read, before.shape) for n in (n_before, n_after)]
-        if step.sign < 0:
-            before, after, ratio = after, before, 1 / ratio
-            variances.reverse()
-        counts = (n_before, n_after)[:: step.sign]
+        # a particle that leaves is fitted as one that lands, the other way round in time
+        (before, n_without, light_without), (after, n_with, light_with) = sums[:: step.sign]
         ranges = (first, second)[:: step.sign]
-        grid = PixelGrid.region(region.rows, region.columns, context.pixel_nm)
-        used = chunk.usable[region.slices]
-        shown = second if step.sign > 0 else first
-        place = (step.start.x_px * context.pixel_nm, step.start.y_px * context.pixel_nm)
-        likelihood = conditional(
-            context.model_at(*place, sum(shown) // 2), grid, before, after, ratio,
-            read_variance_before_e2=variances[0], read_variance_after_e2=variances[1],
-            masked=~used,
-        )  # fmt: skip
-        likelihood = context.with_prior(likelihood, step.start.mass_kda)
+        read = np.square(patch.read_noise_e, dtype=np.float64)  # one number for most cameras
+        variances = [np.broadcast_to(n * read, before.shape) for n in (n_without, n_with)]
         windows = Windows(
             before_e=before,
             after_e=after,
-            n_before=counts[0],
-            n_after=counts[1],
-            power_ratio=(power_after / power_before) ** step.sign,
+            n_before=n_without,
+            n_after=n_with,
+            power_ratio=light_with / light_without,
             read_variance_before_e2=variances[0],
             read_variance_after_e2=variances[1],
-            masked=~used,
+            masked=~chunk.usable[region.slices],
             saturated=chunk.saturated[region.slices],
             frames_before=ranges[0],
             frames_after=ranges[1],
             power=np.empty(0),
         )
+        place = (step.start.x_px * context.pixel_nm, step.start.y_px * context.pixel_nm)
+        likelihood = conditional(
+            context.model_at(*place, sum(ranges[1]) // 2),
+            PixelGrid.region(region.rows, region.columns, context.pixel_nm),
+            before, after, ratio if step.sign > 0 else 1 / ratio,
+            read_variance_before_e2=variances[0], read_variance_after_e2=variances[1],
+            masked=windows.masked,
+        )  # fmt: skip
+        likelihood = context.with_prior(likelihood, step.start.mass_kda)
         return Task(likelihood, region, patch, windows, at, n_before, n_after, crowded, offset)
 
     def trace_spans(
@@ -280,32 +277,15 @@ class TaskBuilder:
         for other, height in zip(seen, crosstalk(patch, image, images), strict=True):
             known += other.sign * height * (frames >= other.at.turns[:, None]).mean(axis=0)
         own = self.neighbours.shared(step, region)
-        if pattern and own is not None:
-            known += self._drifting(step, image, own[1], patch, pattern)
+        if pattern and own is not None:  # which moves, and the particle with it
+            centres, cuts = zip(*self.neighbours.in_blocks(frames), strict=True)
+            light = np.maximum(patch.mean_e, 1e-300)
+            patterns = [pattern.seen(cut) / light - 1 for cut in cuts]
+            moved = [self.neighbours.seen(step, cut, own[1]) - image for cut in cuts]
+            there = (frames >= step.at.frame) == (step.sign > 0)
+            known += np.interp(frames, centres, crosstalk(patch, image, patterns))
+            known += there * np.interp(frames, centres, crosstalk(patch, image, moved))
         return known
-
-    def _drifting(
-        self,
-        step: Step,
-        image: FloatArray,
-        inside: tuple[slice, slice],
-        patch: Patch,
-        pattern: LocalPattern,
-    ) -> FloatArray:
-        """Height that the motion of the pattern, and of the particle itself, adds to each frame."""
-        frames = np.arange(patch.first, patch.first + len(patch.counts))
-        light = np.maximum(patch.mean_e, 1e-300)
-        centres, patterns, moved = [], [], []
-        for start in range(0, frames.size, self._stride):
-            part = frames[start : start + self._stride]
-            cut = self._chunk.cut(int(part[0]), int(part[-1]) + 1)
-            centres.append(float(part.mean()))
-            patterns.append(pattern.seen(cut) / light - 1)
-            moved.append(self.neighbours.seen(step, cut, inside) - image)
-        there = (frames >= step.at.frame) == (step.sign > 0)
-        height: FloatArray = np.interp(frames, centres, crosstalk(patch, image, patterns))
-        height += there * np.interp(frames, centres, crosstalk(patch, image, moved))
-        return height
 
 
 CLIP_STEPS = 6

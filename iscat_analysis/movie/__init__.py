@@ -26,7 +26,6 @@ from iscat_analysis.movie.formats import (
     members_of,
     open_file,
 )
-from iscat_analysis.movie.frame_files import holds_single_frames
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
 from iscat_analysis.movie.plain import MappedFrames, bytes_are_swapped
 from iscat_analysis.movie.stack import (
@@ -41,7 +40,7 @@ from iscat_analysis.movie.stack import (
     single_frame,
 )
 from iscat_analysis.movie.text_tables import read_frame, refuse_twice
-from iscat_analysis.movie.tiff import open_tiff
+from iscat_analysis.movie.tiff import holds_single_frames, open_tiff
 from iscat_analysis.records import StackMetadata
 
 

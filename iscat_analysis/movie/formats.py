@@ -20,10 +20,8 @@ from iscat_analysis.movie.containers import (
     is_matlab_hdf5,
     open_member,
 )
-from iscat_analysis.movie.frame_files import FrameFiles, frames_in, holds_single_frames
-from iscat_analysis.movie.mapped import HDF5_SIGNATURE, WHAT_LIBRARIES_RAISE, Writer, writer_of
+from iscat_analysis.movie.mapped import HDF5_SIGNATURE, Writer, writer_of
 from iscat_analysis.movie.microscopes import needed_package, open_czi, open_nd2
-from iscat_analysis.movie.ome import files_of_set, is_ome
 from iscat_analysis.movie.plain import (
     NPY_SIGNATURE,
     description_of,
@@ -35,7 +33,14 @@ from iscat_analysis.movie.plain import (
 from iscat_analysis.movie.plain import SUFFIXES as RECORDED
 from iscat_analysis.movie.side_files import with_side_files
 from iscat_analysis.movie.stack import Frames, Stack, single_frame
-from iscat_analysis.movie.tiff import TIFF_SUFFIXES, first_texts, open_tiff
+from iscat_analysis.movie.tiff import (
+    TIFF_SUFFIXES,
+    FrameFiles,
+    files_described,
+    frames_in,
+    holds_single_frames,
+    open_tiff,
+)
 from iscat_analysis.reading import is_file, open_regular
 
 
@@ -79,13 +84,13 @@ def _open_zarr(folder: Path, part: str) -> Frames:
 
 
 def _open_hdf5(path: Path, part: str, *, by_columns: bool = False) -> Frames:
-    from iscat_analysis.movie.datasets import open_hdf5  # h5py takes long
+    from iscat_analysis.movie.hdf5 import open_hdf5  # h5py takes long
 
     return open_hdf5(path, part, by_columns=by_columns)
 
 
 def _one_dataset(path: Path) -> bool:
-    from iscat_analysis.movie.datasets import is_one_movie
+    from iscat_analysis.movie.hdf5 import is_one_movie
 
     return is_one_movie(path)
 
@@ -258,11 +263,7 @@ def members_of(address: Path) -> tuple[Path, ...]:
 @lru_cache(maxsize=4096)
 def _described(path: Path, _: tuple[tuple[int, ...], ...]) -> tuple[str, ...]:
     """Name the files of the set that a file describes, in its present state."""
-    try:
-        text = next((text for text in first_texts(path) if is_ome(text)), "")
-        return files_of_set(text, path) if "FileName" in text else ()
-    except (DataError, *WHAT_LIBRARIES_RAISE):  # whoever opens it says what is wrong with it
-        return ()
+    return files_described(path)
 
 
 @lru_cache(maxsize=4096)

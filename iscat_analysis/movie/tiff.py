@@ -1,16 +1,13 @@
-"""TIFF movies: which images are the frames, and their pixels.
-
-What a TIFF file must hold to be read as a movie, and what it must not do to its reader.
-
-Headers of TIFF images that repeat another's but for the place of the pixels.
-
-Cameras write thousands of them, one before each frame, and to read each tag of each takes a tenth
-of a millisecond.  What repeats, byte for byte, was read and judged before.
+"""TIFF movies, in a file, a set of files, or a folder of files with one frame each.
 
 tifffile reads the images.  It repairs what it can, by leaving out what it cannot read; whatever it
 left out is a reason here to refuse the file.  The images are counted against every description: a
 movie that was written frame by frame describes one frame in each image, and a reader that believes
 the first of these descriptions returns one frame of thousands.
+
+Cameras write thousands of headers, one before each frame, and to read each tag of each takes a
+tenth of a millisecond.  A header that repeats another's, byte for byte but for the place of the
+pixels, was read and judged before.
 """
 
 from __future__ import annotations
@@ -19,9 +16,10 @@ import itertools
 import logging
 import math
 import mmap
+import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -34,15 +32,19 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie.descriptions import (
     TIME_FROM_HEIGHTS,
     Described,
+    OmeMovie,
     described_frames,
     elapsed_ms,
+    files_of_set,
     frame_index,
     imagej_hints,
+    is_ome,
     merge,
     metamorph_hints,
     micro_manager_axes,
     micro_manager_hints,
     plain_hints,
+    read_ome,
     time_axis,
 )
 from iscat_analysis.movie.mapped import (
@@ -56,9 +58,10 @@ from iscat_analysis.movie.mapped import (
     release,
     unmap,
 )
-from iscat_analysis.movie.ome import OmeMovie, is_ome, read_ome
 from iscat_analysis.movie.stack import FileSet
+from iscat_analysis.reading import open_regular
 from iscat_analysis.records import InPlace, StackMetadata
+from iscat_analysis.units import listed
 
 STRIP_OFFSETS, TILE_OFFSETS, STRIP_SIZES, TILE_SIZES = 273, 324, 279, 325
 """Codes of the tags that say where the pixels lie, and how many bytes they have."""
@@ -334,28 +337,33 @@ def open_tiff(path: Path, *, member: bool = False) -> TiffFrames | FileSet:
 @contextmanager
 def open_frame_file(path: Path) -> Iterator[TiffFrames]:
     """Open a file that may hold a single frame, for a moment."""
-    frames = cast(TiffFrames, open_tiff(path, member=True))  # a member is no set
-    try:
-        yield frames
-    finally:
-        frames.close()
+    with closing(open_tiff(path, member=True)) as frames:
+        yield cast(TiffFrames, frames)  # a member is no set
 
 
-def is_single_image(path: Path) -> bool:
+def _is_single_image(path: Path) -> bool:
     """Tell whether a file holds one image, and describes no set of files."""
     try:
         with _tiff(path) as file:
             page = file.pages[0]
-            joined = any(is_ome(text) and "FileName" in text for text in _texts(page))
-            return len(file.pages) == 1 and _planes(page) == 1 and not joined
+            return len(file.pages) == 1 and _planes(page) == 1 and not _text_of_set(page)
     except WHAT_LIBRARIES_RAISE:  # whoever opens it says what is wrong with it
         return False
 
 
-def first_texts(path: Path) -> tuple[str, ...]:
-    """Read the descriptions of the first image alone."""
-    with _tiff(path) as file:
-        return _texts(file.pages[0])
+def files_described(path: Path) -> tuple[str, ...]:
+    """Name the files of the set that a file describes; none where it cannot be read."""
+    try:
+        with _tiff(path) as file:
+            text = _text_of_set(file.pages[0])
+        return files_of_set(text, path) if text else ()
+    except (DataError, *WHAT_LIBRARIES_RAISE):  # whoever opens it says what is wrong with it
+        return ()
+
+
+def _text_of_set(page: tifffile.TiffPage) -> str:
+    """Give the OME-XML of an image that names files; empty where there is none."""
+    return next((t for t in _texts(page) if is_ome(t) and "FileName" in t), "")
 
 
 def _open(
@@ -614,3 +622,150 @@ def order_by_time(images: Sequence[Image]) -> list[int] | None:
     order = np.lexsort(keys[::-1]) if keys else np.arange(len(images))
     found: list[int] = order.tolist()
     return None if found == [*range(len(images))] else found
+
+
+_DIGITS = re.compile(r"(\d+)", flags=re.ASCII)
+
+
+def frames_in(folder: Path) -> tuple[Path, ...]:
+    """List the TIFF files of a folder in natural order: frame2 before frame10."""
+    try:
+        inside = [path for path in folder.iterdir() if path.suffix.lower() in TIFF_SUFFIXES]
+    except OSError:
+        return ()
+    shown = (path for path in inside if not path.name.startswith(".") and path.is_file())
+    return tuple(sorted(shown, key=lambda path: (_numbers(path), path.name)))
+
+
+def holds_single_frames(folder: Path, *, named: bool = False) -> bool:
+    """Tell whether a folder is a movie of TIFF files with one image each.
+
+    Unless somebody names it as a movie, it must have ten files, whose numbers alone differ.
+    """
+    files = frames_in(folder)
+    if len(files) < (2 if named else 10):
+        return False
+    alike = named or len({*map(_pattern, files)}) == 1
+    return alike and _is_single_image(files[0]) and _is_single_image(files[-1])
+
+
+class FrameFiles:
+    """The frames of a folder; a file is open only while it is read."""
+
+    def __init__(self, folder: Path) -> None:
+        self.files = frames_in(folder)
+        _refuse_mixture(self.files, folder)
+        _refuse_gaps(self.files, folder)
+        with open_frame_file(self.files[0]) as first:
+            self._expected = first.shape, first.dtype
+            self.metadata, self.notes = first.metadata, first.notes
+            self._stored, place = first.stored, first.place
+        self.shape = (len(self.files), *self._expected[0][1:])
+        self.dtype = self._expected[1]
+        self._size = self.shape[1] * self.shape[2] * self.dtype.itemsize
+        if place is None:
+            self._places = [self._place(file) for file in self.files]
+        else:  # headers that repeat are read once
+            around = _around(self.files[0], place, self._size)
+            self._places = [
+                place if _around(file, place, self._size) == around else self._place(file)
+                for file in self.files
+            ]
+
+    def _place(self, file: Path) -> int | None:
+        """Read the header of a file that is not like the first one."""
+        with open_frame_file(file) as frames:
+            if frames.shape[0] > 1:
+                raise DataError(
+                    f"{file}: holds {frames.shape[0]} frames, but the other files of its folder "
+                    "hold one each; leave only the frames of one movie there"
+                )
+            if (frames.shape, frames.dtype) != self._expected or frames.stored != self._stored:
+                raise DataError(
+                    f"{file}: has other pixels than {self.files[0].name}; leave only the frames "
+                    "of one movie in the folder"
+                )
+            return frames.place
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames ``[start, stop)`` as a new array in native byte order [counts]."""
+        block = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
+        for number in range(start, stop):
+            file, place = self.files[number], self._places[number]
+            if place is None:  # compressed
+                with open_frame_file(file) as frames:
+                    block[number - start] = frames.read(0, 1)[0]
+                continue
+            try:
+                with open_regular(file) as opened:
+                    opened.seek(place)
+                    raw = opened.read(self._size)
+            except OSError as error:
+                raise DataError(f"{file}: can no longer be read ({error.strerror})") from None
+            if len(raw) < self._size:
+                raise DataError(f"{file}: became shorter while it was open; start again")
+            block[number - start] = np.frombuffer(raw, self._stored).reshape(self.shape[1:])
+        return block
+
+    def close(self) -> None:
+        """Do nothing: no file is open."""
+
+
+def _around(path: Path, place: int, size: int) -> tuple[bytes, bytes, int]:
+    """Give what a file holds before and behind its pixels, and its length."""
+    try:
+        with open_regular(path) as file:
+            before = file.read(place)
+            end = file.seek(0, 2)
+            file.seek(place + size)
+            return before, file.read(), end
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def _parts(path: Path) -> list[str]:
+    return _DIGITS.split(path.name)
+
+
+def _numbers(path: Path) -> list[tuple[int, int | str]]:
+    """Give what a name is sorted by: texts by their letters, numbers by their size."""
+    return [(1, int(part)) if k % 2 else (0, part) for k, part in enumerate(_parts(path))]
+
+
+def _pattern(path: Path) -> str:
+    return "#".join(_parts(path)[::2])
+
+
+def _refuse_mixture(files: Sequence[Path], folder: Path) -> None:
+    """Refuse names of several kinds: one of them may be a background, a mean or another channel."""
+    kinds = list(dict.fromkeys(map(_pattern, files)))
+    if len(kinds) > 1:
+        raise DataError(
+            f"{folder}: holds TIFF files with different kinds of names "
+            f"({', '.join(kinds[:3])}); leave only the frames of one movie there"
+        )
+
+
+def _refuse_gaps(files: Sequence[Path], folder: Path) -> None:
+    """Refuse numbers of which some are missing, and two that count different things."""
+    columns = zip(*([int(part) for part in _parts(file)[1::2]] for file in files), strict=True)
+    varying = [np.array(column) for column in columns if len(set(column)) > 1]
+    if len(varying) > 1 and np.prod([len(np.unique(column)) for column in varying]) == len(files):
+        counts = " x ".join(str(len(np.unique(column))) for column in varying)
+        raise DataError(
+            f"{folder}: the names of its {len(files)} files count {counts} frames by several "
+            "numbers, as of channels, heights or positions; leave only the frames of one there"
+        )
+    if len(varying) != 1:
+        return
+    steps = np.diff(varying[0])
+    step = int(steps.min())
+    if step > 0 and not (steps % step).any() and np.median(steps) == step:
+        every = np.arange(varying[0][0], varying[0][-1] + 1, step)
+        missing = np.setdiff1d(every, varying[0])
+        if 0 < missing.size < len(files):
+            raise DataError(
+                f"{folder}: of the numbers in the names of its files {missing.size} are missing "
+                f"({listed(missing, 3)}); copy the folder again or, if these frames were left out "
+                "on purpose, number the files anew"
+            )

@@ -167,17 +167,13 @@ def analyse(
         found = kind.find(ready, run)  # background, detect, fit, posterior, bounds
         with parts_kept(partial if kind.keeps_parts else None):
             extra: dict[str, Any] = {}
-            stopped = found.interrupted
-            if kind.inject and run.inject and not stopped:
+            if kind.inject and run.inject and not found.interrupted:
                 try:
                     extra = {"injection": kind.inject(ready, run, found)}
                 except KeyboardInterrupt:
-                    stopped = True
+                    found = replace(found, interrupted=True)
                 run.clock.lap("injection")
-            return make_analysis(
-                kind, ready, run, found, extra,
-                command=command, started=started, interrupted=stopped,
-            )  # fmt: skip
+            return make_analysis(kind, ready, run, found, extra, command=command, started=started)
 
 
 def prepare(movie: Stack, config: Config, run: Run) -> Prepared:

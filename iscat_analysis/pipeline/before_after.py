@@ -13,19 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
+from iscat_analysis import diagnosis
 from iscat_analysis.camera import measure_windows, refine_power, start_power
-from iscat_analysis.diagnosis import (
-    Noise,
-    Prepared,
-    drift_warning,
-    examine_background,
-    judge_background,
-    misfit_warning,
-    pixel_warnings,
-    repeats_warning,
-    uneven_warning,
-    without_cut_off,
-)
+from iscat_analysis.diagnosis import Noise, Prepared
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.camera import MODEL_MISFITS
 from iscat_analysis.findings.particles import MASSES_CHANGE
@@ -114,7 +104,7 @@ def background_context(ready: Prepared, windows: Windows) -> tuple[AnalysisConte
     """Judge the noise of the background, and make models and filter for it."""
     config, after = ready.config, windows.frames_after
     still = not config.fit.follows_tracks
-    noise = judge_background(
+    noise = diagnosis.judge_background(
         ready.steady, ready.camera, windows, still=still, additive=not config.optics.interferes
     )
     searches = 1 if still else after[1] - after[0]
@@ -140,7 +130,7 @@ def fit_together(
         run.report(index_finding(context, untold, len(untold), len(events)))
     run.clock.lap("fit")
     # rings of many particles that a wrong microscope leaves over look uneven too
-    cause = misfit_warning(context.config, events)
+    cause = diagnosis.misfit_warning(context.config, events)
     misfit = MODEL_MISFITS({"cause": cause}) if cause else None
     run.report(misfit or _uneven_finding(context, ready.steady.name, windows, events))
     repeats, empty = field_repeats(context, ready.steady, ready.camera, windows, events)
@@ -178,15 +168,15 @@ def _judged(ready: Prepared, run: Run, windows: Windows) -> Background:
     context, noise = background_context(ready, windows)
     run.warm_up(context)
     run.clock.lap("model")
-    repeated = None if still else repeats_warning(movie, windows)
-    uneven = None if still else uneven_warning(config, movie.name, windows)
+    repeated = None if still else diagnosis.repeats_warning(movie, windows)
+    uneven = None if still else diagnosis.uneven_warning(config, movie.name, windows)
     summary: dict[str, Any] = {}
     moved = None
     if not context.additive:
-        summary = examine_background(movie, ready.camera, windows)
+        summary = diagnosis.examine_background(movie, ready.camera, windows)
         summary["noise_spectrum"] = noise.summary
-        moved = drift_warning(movie.name, summary)
-    run.report(*noise.findings_of(movie.name), *pixel_warnings(*windows.left_out))
+        moved = diagnosis.drift_warning(movie.name, summary)
+    run.report(*noise.findings_of(movie.name), *diagnosis.pixel_warnings(*windows.left_out))
     run.report(repeated, uneven, moved)
     run.clock.lap("background")
     doubt = uneven or moved
@@ -204,7 +194,7 @@ def _sum_frames(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
     windows = sums(ready.steady)
     if not config.optics.interferes:
         return ready, windows
-    movie, finding = without_cut_off(ready.steady, camera, windows)
+    movie, finding = diagnosis.without_cut_off(ready.steady, camera, windows)
     run.report(finding)
     if movie is ready.steady:
         return ready, windows
@@ -366,10 +356,10 @@ def _uneven_finding(
         away &= np.hypot(x - x_nm, y - y_nm) > near_nm
     # of the field, from which what no particle explains is told
     if away.mean() < 0.25:
-        return uneven_warning(context.config, name, windows)
+        return diagnosis.uneven_warning(context.config, name, windows)
     if context.additive:
         signal = signal * photons_scale(context, windows)
-    return uneven_warning(context.config, name, windows, np.where(away, signal, np.nan))
+    return diagnosis.uneven_warning(context.config, name, windows, np.where(away, signal, np.nan))
 
 
 def _flag_changing_masses(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -18,22 +18,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from iscat_analysis import diagnosis
 from iscat_analysis.bounds import holevo_over_quantum
 from iscat_analysis.calibration import as_given
 from iscat_analysis.camera import Camera, FieldSample, Pattern, middle_of, pattern_of
 from iscat_analysis.config import MODES, MOVES, Config, config_to_toml
-from iscat_analysis.diagnosis import (
-    Prepared,
-    Stretches,
-    fixed_height_warning,
-    landing_rate_warning,
-    large_warning,
-    line_warning,
-    nonlinearity_warning,
-    residue_warning,
-    scale_warning,
-    sign_warning,
-)
+from iscat_analysis.diagnosis import Prepared, Stretches
 from iscat_analysis.executors import versions
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.particles import SPREAD_NOT_MEASURED
@@ -70,24 +60,11 @@ from iscat_analysis.species.diameters import Sizes, describe_sizes
 from iscat_analysis.species.tables import filter_efficiency, shared_error
 from iscat_analysis.text import printable
 from iscat_analysis.threads import start_in_thread
+from iscat_analysis.trust import systematic
 from iscat_analysis.trust.checks import Checked, checked, repeat_columns, spread_verdict
-from iscat_analysis.trust.systematic import (
-    SCALE,
-    SPHERES,
-    budget_of,
-    contributions,
-    explained_kda,
-    misfit_error,
-    total,
-    wide_species,
-)
 from iscat_analysis.trust.uneven_reference import reference_map
-from iscat_analysis.units import count
+from iscat_analysis.units import are, count
 
-_PLACES, _TOGETHER = 48, 6  # where some frames are looked at, and how many
-_FEWEST = 3  # of these that must have light
-_BINS = 40  # of time, in which events are counted
-_LIT = 0.1  # of the median pixel's light, which one that tells the noise has
 _DROPPED = "dark, cut off, or the same as the frame before: left out"
 _HIDDEN = "partly hidden by bright or ill-described particles"
 
@@ -109,8 +86,8 @@ def timeline_of(ready: Prepared, found: DetectionResult, table: pd.DataFrame) ->
     first, last = _span(found.compared)
     if first == last:  # it was interrupted before any frame was done
         return {}
-    together = min(_TOGETHER, last - first)
-    starts = np.unique(np.linspace(first, last - together, _PLACES).astype(int)).tolist()
+    together = min(6, last - first)  # at 48 places
+    starts = np.unique(np.linspace(first, last - together, 48).astype(int)).tolist()
     kept = ready.stretches.kept if ready.stretches.breaks else ((first, last),)
     inside = [next((k for k, s in enumerate(kept) if s[0] <= f < s[1]), None) for f in starts]
     seen = [
@@ -141,7 +118,7 @@ def look_at(movie: Stack, camera: Camera, start: int, stop: int) -> Seen:
     counts = movie.read(start, stop)
     light, repeats = measure_frames(counts, camera)
     good = well_lit(light, DARK) & ~repeats
-    if good.sum() < _FEWEST:
+    if good.sum() < 3:
         return Seen()
     few, theirs = counts[good], camera
     sample = FieldSample.of((movie.shape[1], movie.shape[2]))
@@ -154,7 +131,7 @@ def look_at(movie: Stack, camera: Camera, start: int, stop: int) -> Seen:
     steady = power.mean() / power
     electrons *= steady
     mean = electrons.mean(axis=0)
-    used = (mean > _LIT * float(np.median(mean))) & ~theirs.saturated(few.max(axis=0))
+    used = (mean > 0.1 * float(np.median(mean))) & ~theirs.saturated(few.max(axis=0))
     expected = mean + theirs.dark_variance_e2(few)
     noise = math.nan
     if used.any():
@@ -216,7 +193,7 @@ def _intervals(stretches: Stretches, found: DetectionResult) -> Iterator[dict[st
 
 def _events(table: pd.DataFrame, first: int, last: int) -> dict[str, Any]:
     """Count events in equal parts of the movie, those that are ok and others."""
-    edges = np.unique(np.linspace(first, last, _BINS + 1).astype(int))
+    edges = np.unique(np.linspace(first, last, 40 + 1).astype(int))
     frame = table["frame"].to_numpy(float)
     ok = (table["status"] == Status.OK.value).to_numpy()
     others = ~ok & is_event(table)
@@ -230,10 +207,6 @@ def _events(table: pd.DataFrame, first: int, last: int) -> dict[str, Any]:
 def _numbers(values: Sequence[float] | NDArray[np.float64]) -> list[float | None]:
     """Give numbers, and nothing where there is none."""
     return [float(value) if math.isfinite(value) else None for value in values]
-
-
-_HEIGHTS = 65
-"""Heights at which the Holevo bound is computed for a table; linear in between."""
 
 
 _NO_SIZE = {
@@ -344,22 +317,28 @@ def species_of(
 def _sizes(context: AnalysisContext, table: pd.DataFrame) -> Sizes | None:
     """Describe the diameters of spheres that were fitted once each, of rows that are ok."""
     good = table[table["status"] == Status.OK]
-    diameter, sigma, snr = (
-        good[name].to_numpy(float) for name in ("diameter_nm", "sigma_diameter_nm", "snr")
-    )
     findings = []
     # Standard deviations above the threshold from which hardly any sphere is missed.
-    near = diameter[snr < context.templates.threshold + 3.0]
+    near = good.loc[good["snr"] < context.templates.threshold + 3.0, "diameter_nm"]
     if near.size:
         ends = {"least_nm": number(near.min()), "most_nm": number(near.max())}
-        ends |= {"amount": count(near.size, "sphere"), "verb": "is" if near.size == 1 else "are"}
+        ends |= {"amount": count(near.size, "sphere"), "verb": are(near.size)}
         findings.append(SPHERES_MISSED(ends))
-    common = 0.0
-    if "systematic_diameter_nm" in good:
-        common = _median(good["systematic_diameter_nm"] / good["diameter_nm"]) or 0.0
-    return describe_sizes(
-        diameter, sigma, seed=context.config.compute.seed, common=common, findings=findings
-    )
+    common = _systematic_share(good, "diameter_nm")
+    return _sizes_in(good, "diameter_nm", context.config.compute.seed, common, findings)
+
+
+def _sizes_in(
+    good: pd.DataFrame, column: str, seed: int, common: float, findings: list[Finding]
+) -> Sizes | None:
+    diameter, sigma = (good[name].to_numpy(float) for name in (column, f"sigma_{column}"))
+    return describe_sizes(diameter, sigma, seed=seed, common=common, findings=findings)
+
+
+def _systematic_share(good: pd.DataFrame, column: str) -> float:
+    """Give the median systematic error of a column over its value; 0 where none is known."""
+    error = good.get(f"systematic_{column}", math.nan)
+    return _median(error / good[column]) or 0.0
 
 
 def sizes_of_tracks(tracks: pd.DataFrame, seed: int) -> Sizes | None:
@@ -376,16 +355,9 @@ def sizes_of_tracks(tracks: pd.DataFrame, seed: int) -> Sizes | None:
     if len(good) < len(tracks):
         left_out = count(len(tracks) - len(good), "track")
         findings.append(TRACKS_LEFT_OUT({"amount": left_out, "tracks": len(tracks)}))
-    common = 0.0
-    if "systematic_mass_kda" in good:  # a third, as the mass goes with the cube of the diameter
-        common = (_median(good["systematic_mass_kda"] / good["mass_kda"]) or 0.0) / 3
-    return describe_sizes(
-        good["optical_diameter_nm"].to_numpy(float),
-        good["sigma_optical_diameter_nm"].to_numpy(float),
-        seed=seed,
-        common=common,
-        findings=findings,
-    )
+    # a third, as the mass goes with the cube of the diameter
+    common = _systematic_share(good, "mass_kda") / 3
+    return _sizes_in(good, "optical_diameter_nm", seed, common, findings)
 
 
 def _repeats(found: EmpiricalSpread) -> dict[str, Any]:
@@ -406,10 +378,11 @@ def _repeats(found: EmpiricalSpread) -> dict[str, Any]:
 def _holevo_over_quantum(context: AnalysisContext, z_nm: FloatArray) -> dict[str, FloatArray]:
     """Cost of fitting height and mass at once, of each particle, by parameter.
 
-    It depends on the height through the evanescent waves alone, and smoothly.
+    It depends on the height through the evanescent waves alone, and smoothly: it is computed at
+    some heights, and linear in between.
     """
     free = FREE_PARAMETERS[context.mode]
-    heights = np.linspace(max(z_nm.min(), 0.0), max(z_nm.max(), 1.0), _HEIGHTS)
+    heights = np.linspace(max(z_nm.min(), 0.0), max(z_nm.max(), 1.0), 65)
     costs = [holevo_over_quantum(context.model, float(z), free) for z in heights]
     return {name: np.interp(z_nm, heights, [cost[name] for cost in costs]) for name in free}
 
@@ -498,19 +471,20 @@ def reported_rows(
     columns: dict[str, pd.Series | FloatArray] = {
         name: fits[name] * factor for name, factor in seen.scale.items()
     }
-    unfit, threshold = misfit_error(fits, found.context.roi_px**2), 0.0
+    unfit, threshold = systematic.misfit_error(fits, found.context.roi_px**2), 0.0
     if not MODES[mode].follows_tracks:
         threshold = found.context.templates.threshold
     elif summary.get("optics"):  # which were tested
         from iscat_analysis.tracking.optics import mass_error
 
         unfit = mass_error(summary["optics"])
-    shared = contributions(
+    shared = systematic.contributions(
         config, fits, summary,
         mass_share=unfit, scale=found.context.model.scale, held_kda=seen.shifts_kda,
         threshold_snr=threshold,
     )  # fmt: skip
-    columns |= {f"systematic_{name}": error for name, error in total(shared, len(fits)).items()}
+    for name, error in systematic.total(shared, len(fits)).items():
+        columns[f"systematic_{name}"] = error
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)
     table = make_rows(fits, columns)
@@ -521,21 +495,23 @@ def reported_rows(
         table = with_diameters(table, config.particle.density)
     budget: list[dict[str, Any]] = []
     if "mass_kda" in FREE_PARAMETERS[mode]:
-        unknown = SPHERES if config.fits_sizes else SCALE if config.calibration is None else None
+        unknown = None if config.calibration else systematic.SCALE
+        if config.fits_sizes:
+            unknown = systematic.SPHERES
         scaled = config.fit.sigma == "measured"
-        budget = budget_of(table, shared, seen.achieved, unknown=unknown, scaled=scaled)
+        budget = systematic.budget_of(table, shared, seen.achieved, unknown=unknown, scaled=scaled)
     return ReportedRows(table, seen, budget)
 
 
 CHECKS: tuple[Callable[[DetectionResult, pd.DataFrame], Finding | None], ...] = (
-    lambda found, _: scale_warning(found.context.model.scale),
-    lambda found, table: line_warning(found.context.config, table),
-    lambda found, table: nonlinearity_warning(found.context.model.scale, table),
-    lambda found, table: sign_warning(found.context.config, table),
-    lambda found, table: large_warning(found.context.config, table),
-    lambda found, table: landing_rate_warning(table) if _slides(found) else None,
+    lambda found, _: diagnosis.scale_warning(found.context.model.scale),
+    lambda found, table: diagnosis.line_warning(found.context.config, table),
+    lambda found, table: diagnosis.nonlinearity_warning(found.context.model.scale, table),
+    lambda found, table: diagnosis.sign_warning(found.context.config, table),
+    lambda found, table: diagnosis.large_warning(found.context.config, table),
+    lambda found, table: diagnosis.landing_rate_warning(table) if _slides(found) else None,
     lambda found, table: (
-        residue_warning(table, found.summary["window_frames"]) if _slides(found) else None
+        diagnosis.residue_warning(table, found.summary["window_frames"]) if _slides(found) else None
     ),
 )
 """What the events of a movie and the table of their rows tell together."""
@@ -554,13 +530,11 @@ def make_analysis(
     *,
     command: str,
     started: str,
-    interrupted: bool,
 ) -> Analysis:
     """Put everything that is reported of a movie into an `Analysis`."""
-    progress = run.progress
-    if interrupted:  # what was finished is now gathered and kept, which takes a moment
-        progress("report", 0, 1)
-        progress = silent  # another stage would end the time that writing is given
+    if found.interrupted:  # what was finished is now gathered and kept, which takes a moment
+        run.progress("report", 0, 1)
+        run = replace(run, progress=silent)  # another stage would end the time to write
     context, compared = found.context, found.compared
     config = context.config
     further = {**ready.summary, **({kind.heading: found.summary} if found.summary else {})}
@@ -580,36 +554,13 @@ def make_analysis(
     uneven = reference_map(config, table)
     run.report(*seen.findings, uneven and uneven.finding)
     run.report(*(check(found, table) for check in CHECKS))
-    scaled = config.fit.sigma == "measured"
     if found.repeats:
-        fluctuates = seen.fluctuation is not None and seen.fluctuation.is_seen
-        had = ("mass_kda",) if fluctuates else ()  # by σ
-        further["repeats"], understated = spread_verdict(
-            {name: one for name, one in seen.achieved.items() if name not in had},
-            found.summary,
-            scaled=scaled,
-            rejected=is_rejected(table),
-            sliding=config.background.slides,
-        )
+        further["repeats"], understated = _judge_spread(found, seen, table)
         run.report(understated)
-    elif scaled and len(table):
+    elif config.fit.sigma == "measured" and len(table):
         run.report(SPREAD_NOT_MEASURED())
-    tracks: pd.DataFrame | None = None
-    films: tuple[Film, ...] = ()
-    if found.followed is not None:
-        from iscat_analysis.tracking.tracks import common_motion, make_films, tracks_of
-
-        followed = found.followed
-        tracks, track_summary, of_tracks = tracks_of(
-            context, table, followed.windows,
-            masses=followed.masses, ticks=ticks, progress=progress,
-        )  # fmt: skip
-        further |= track_summary
-        run.report(*of_tracks, *common_motion(table, config.camera.frame_rate_hz, ticks))
-        run.report(fixed_height_warning(config, table))
-        backgrounds = followed.parts or (followed.windows,)
-        films = make_films(context, ready.steady, ready.camera, backgrounds, table, tracks)
-        run.clock.lap("tracks")
+    tracks, films, of_tracks = _tracks(ready, run, found, table, ticks)
+    further |= of_tracks
     if scale.refusal:
         table = flagged(table, Status.UNCALIBRATED_OPTICS)
         tracks = None if tracks is None else flagged(tracks, TrackStatus.UNCALIBRATED_OPTICS)
@@ -617,10 +568,10 @@ def make_analysis(
     timeline_future = start_in_thread(timeline_of, ready, found, table)
     searched = found.summary.get("searched_share") if found.summary else None
     described = species_of(context, table, searched, tracks)
-    explained = {"explained_kda": explained_kda(budget)}
+    explained = {"explained_kda": systematic.explained_kda(budget)}
     described["across_particles"] = [one | explained for one in described["across_particles"]]
     calibrated = config.calibration is not None or config.fits_sizes
-    run.report(wide_species(described["across_particles"], calibrated=calibrated))
+    run.report(systematic.wide_species(described["across_particles"], calibrated=calibrated))
     timeline = timeline_future.result()
     summary = summary_of(context, table, compared, run.clock.seconds, seen.achieved)
     provenance = Provenance(
@@ -642,7 +593,7 @@ def make_analysis(
         },
         "seed": provenance.seed,
         "versions": dict(provenance.versions),
-        "interrupted": interrupted,
+        "interrupted": found.interrupted,
         "findings": run.findings.summary,
         "warnings": run.findings.warnings,
         **described,
@@ -665,6 +616,47 @@ def make_analysis(
         films=films,
         response=ready.response.table if ready.response is not None else None,
     )
+
+
+def _judge_spread(
+    found: DetectionResult, seen: Checked, table: pd.DataFrame
+) -> tuple[dict[str, Any], Finding | None]:
+    """Compare the spread between parts of the frames with the bound."""
+    config = found.context.config
+    fluctuates = seen.fluctuation is not None and seen.fluctuation.is_seen
+    had = ("mass_kda",) if fluctuates else ()  # by σ
+    return spread_verdict(
+        {name: one for name, one in seen.achieved.items() if name not in had},
+        found.summary,
+        scaled=config.fit.sigma == "measured",
+        rejected=is_rejected(table),
+        sliding=config.background.slides,
+    )
+
+
+def _tracks(
+    ready: Prepared,
+    run: Run,
+    found: DetectionResult,
+    table: pd.DataFrame,
+    ticks: NDArray[Any] | None,
+) -> tuple[pd.DataFrame | None, tuple[Film, ...], Mapping[str, Any]]:
+    """Describe particles that were followed, draw films of some, and summarise them."""
+    context, followed = found.context, found.followed
+    if followed is None:
+        return None, (), {}
+    from iscat_analysis.tracking.tracks import common_motion, make_films, tracks_of
+
+    tracks, summary, findings = tracks_of(
+        context, table, followed.windows,
+        masses=followed.masses, ticks=ticks, progress=run.progress,
+    )  # fmt: skip
+    run.report(*findings, *common_motion(table, context.config.camera.frame_rate_hz, ticks))
+    run.report(diagnosis.fixed_height_warning(context.config, table))
+    backgrounds = followed.parts or (followed.windows,)
+    films = make_films(context, ready.steady, ready.camera, backgrounds, table, tracks)
+    run.clock.lap("tracks")
+    return tracks, films, summary
 
 
 def _unique_frames(compared: Compared) -> tuple[NDArray[np.int64], NDArray[np.intp]]:

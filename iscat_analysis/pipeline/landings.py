@@ -37,6 +37,7 @@ from iscat_analysis.landing.find import analyse_landings, find_landings
 from iscat_analysis.landing.maps import SidelobeFilter
 from iscat_analysis.landing.neighbours import Neighbours, Step
 from iscat_analysis.landing.tasks import StepEvent, TaskBuilder, patch_of, trace_of
+from iscat_analysis.movie import ChangedFrames
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.finish import reported_rows
 from iscat_analysis.pipeline.kinds import Kind, Look, candidate_table
@@ -85,60 +86,31 @@ class Injected:
     contrast: FloatArray
 
 
-class InjectedMovie:
+@dataclass(frozen=True, eq=False)
+class InjectedMovie(ChangedFrames):
     """A movie with particles added as it is read."""
 
-    def __init__(
-        self,
-        movie: CountSource,
-        camera: Camera,
-        particles: list[Injected],
-        seed: int,
-        trajectory: Trajectory | None = None,
-    ) -> None:
-        self._trajectory = trajectory
-        self._movie = movie
-        self._camera = camera
-        self._particles = particles
-        self._seed = seed
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Frames, rows, columns."""
-        return self._movie.shape
-
-    @property
-    def name(self) -> str:
-        """What messages call it."""
-        return self._movie.name
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the stored counts."""
-        return self._movie.dtype
+    camera: Camera
+    particles: list[Injected]
+    seed: int
+    trajectory: Trajectory | None = None
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Frames ``[start, stop)`` with the particles, shape (stop − start, y, x)."""
-        counts = np.array(self._movie.read(start, stop))
-        for number, particle in enumerate(self._particles):
-            rows = slice(particle.corner[0], particle.corner[0] + particle.contrast.shape[0])
-            columns = slice(particle.corner[1], particle.corner[1] + particle.contrast.shape[1])
-            gain, offset = (
-                v[rows, columns] if isinstance(v, np.ndarray) else v
-                for v in (self._camera.gain_e_per_adu, self._camera.offset_adu)
-            )
-            move = self._mover(particle)
+        counts = np.array(self.source.read(start, stop))
+        for number, particle in enumerate(self.particles):
+            (y, x), (ny, nx) = particle.corner, particle.contrast.shape
+            box = slice(y, y + ny), slice(x, x + nx)
+            camera, contrast_at = self.camera.part(box), self._mover(particle)
             for t in range(max(start, particle.frame), min(stop, particle.leave)):
-                rng = np.random.default_rng(
-                    np.random.SeedSequence(self._seed, spawn_key=(number, t))
-                )
-                here = counts[t - start, rows, columns]
-                here[...] = _with_particle(here, move(t), gain, offset, rng)
+                seed = np.random.SeedSequence(self.seed, spawn_key=(number, t))
+                here, rng = counts[t - start][box], np.random.default_rng(seed)
+                here[...] = _with_particle(here, contrast_at(t), camera, rng)
         return counts
 
     def _mover(self, particle: Injected) -> Callable[[int], FloatArray]:
         """Make the function that gives the contrast of a particle in a frame."""
-        way = self._trajectory
+        way = self.trajectory
         if way is None:
             return lambda _: particle.contrast
         mover = Mover((particle.contrast.shape[0], particle.contrast.shape[1]))
@@ -149,14 +121,10 @@ class InjectedMovie:
 
 
 def _with_particle(
-    counts: NDArray[Any],
-    contrast: FloatArray,
-    gain: float | FloatArray,
-    offset: float | FloatArray,
-    rng: np.random.Generator,
+    counts: NDArray[Any], contrast: FloatArray, camera: Camera, rng: np.random.Generator
 ) -> NDArray[Any]:
-    electrons = np.maximum((counts - offset) * gain, 0.0)
-    size = np.abs(contrast) * electrons
+    gain = camera.gain_e_per_adu
+    size = np.abs(contrast) * np.maximum(camera.to_electrons(counts), 0.0)
     variance = np.where(contrast < 0, size * np.maximum(1 + contrast, 0.0), size)
     change = np.copysign(size, contrast) + np.sqrt(variance) * rng.standard_normal(size.shape)
     if not np.issubdtype(counts.dtype, np.integer):
@@ -175,19 +143,10 @@ def inject_and_recover(ready: Prepared, run: Run, result: DetectionResult) -> di
     frames = fitted_frames(movie, config)
     window = int(result.summary["window_frames"])
     fixed = config.background.model_copy(update={"window_frames": window})
-    seed = config.compute.seed
-    particles = draw_particles(
-        result.context,
-        (movie.shape[1], movie.shape[2]),
-        frames,
-        window,
-        run.inject,
-        result.fits,
-        seed,
-    )
+    particles = _draw_particles(result, movie.shape[1:], frames, window, run.inject)
     lines = result.context.lines if isinstance(result.context.lines, LightModel) else None
     again = analyse_landings(
-        InjectedMovie(movie, camera, particles, seed, result.trajectory),
+        InjectedMovie(movie, camera, particles, config.compute.seed, result.trajectory),
         config.model_copy(update={"background": fixed}),
         camera,
         Run(progress=run.progress, executor=run.executor),  # the user has been told already
@@ -195,29 +154,21 @@ def inject_and_recover(ready: Prepared, run: Run, result: DetectionResult) -> di
     )
     if again.interrupted:
         raise KeyboardInterrupt
-    rows = reported_rows(again).table
-    return recovery(
-        particles,
-        counted(rows),
-        frames[1],
-        result.context.roi_px / 2,
-        window,
-        sign=reported_steps(result.context),
-        threshold=result.context.templates.threshold,
-        searched=again.summary["searched_share"],
-    )
+    rows = counted(reported_rows(again).table)
+    searched = again.summary["searched_share"] or 1.0
+    return _recovery(particles, rows, result.context, frames[1], window, searched)
 
 
-def draw_particles(
-    context: AnalysisContext,
+def _draw_particles(
+    result: DetectionResult,
     field_px: tuple[int, int],
     frames: tuple[int, int],
     window: int,
     count: int,
-    table: pd.DataFrame,
-    seed: int,
 ) -> list[Injected]:
     """Draw random places, times and masses, the masses from those that were found."""
+    context, table = result.context, result.fits
+    seed, height_nm = context.config.compute.seed, context.config.particle.nominal_height_nm
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**31,)))
     good = table["mass_kda"][table["status"] == Status.OK].abs().to_numpy(dtype=float)
     if not good.size:
@@ -227,39 +178,32 @@ def draw_particles(
     stay = 3 * window
     first = frames[0] + window
     last = max(frames[1] - window - stay, first + 1)
-    landings = np.sort(rng.integers(first, last, count))
+    half, pixel = round(LARGEST_IMAGE * context.roi_px), context.pixel_nm
     particles = []
-    for landing in landings:
-        x = float(rng.uniform(margin, field_px[1] - 1 - margin))
-        y = float(rng.uniform(margin, field_px[0] - 1 - margin))
+    for frame in np.sort(rng.integers(first, last, count)).tolist():
+        x, y = (float(rng.uniform(margin, size - 1 - margin)) for size in field_px[::-1])
         mass = float(rng.choice(good))
-        spans = []
-        for centre, size in zip((y, x), field_px, strict=True):
-            middle, half = round(centre), round(LARGEST_IMAGE * context.roi_px)
-            spans.append((max(middle - half, 0), min(middle + half + 1, size)))
-        grid = PixelGrid.region(spans[0], spans[1], context.pixel_nm)
-        place = (x * context.pixel_nm, y * context.pixel_nm)
-        image = context.wide_at(*place, int(landing)).image(
-            grid, *place, context.config.particle.nominal_height_nm, mass
+        rows, columns = (
+            (max(round(centre) - half, 0), min(round(centre) + half + 1, size))
+            for centre, size in zip((y, x), field_px, strict=True)
         )
-        frame = int(landing)
+        grid, place = PixelGrid.region(rows, columns, pixel), (x * pixel, y * pixel)
+        image = context.wide_at(*place, frame).image(grid, *place, height_nm, mass)
         leave = min(frame + stay, frames[1])
-        particles.append(Injected(frame, leave, x, y, mass, (spans[0][0], spans[1][0]), image))
+        particles.append(Injected(frame, leave, x, y, mass, (rows[0], columns[0]), image))
     return particles
 
 
-def recovery(
+def _recovery(
     particles: list[Injected],
     found: pd.DataFrame,
+    context: AnalysisContext,
     last: int,
-    separation_px: float,
     window: int,
-    *,
-    sign: int = 0,
-    threshold: float | None = None,
-    searched: float | None = None,
+    searched: float,
 ) -> dict[str, Any]:
     """Compare what was found with what was added."""
+    separation_px, sign = context.roi_px / 2, reported_steps(context)
     steps = [(p.frame, 1, p) for p in particles]
     steps += [(p.leave, -1, p) for p in particles if p.leave < last]
     frame, x, y, mass, error = (
@@ -297,10 +241,10 @@ def recovery(
         "recall_isolated": len(chosen) / isolated if isolated else None,
     }
     bounds = found["crb_mass_kda"][found["status"] == Status.OK].to_numpy(dtype=float)
-    if threshold is not None and rows and np.isfinite(bounds).any():
-        sigma = float(np.nanmedian(bounds))
+    if rows and np.isfinite(bounds).any():
+        sigma, threshold = float(np.nanmedian(bounds)), context.templates.threshold
         powers = [power_searched(p.mass_kda / sigma, threshold) for *_, p in rows]
-        result["predicted"] = (searched or 1.0) * float(np.mean(powers))
+        result["predicted"] = searched * float(np.mean(powers))
     if len(chosen) < 2:
         return result
     index = [best for best, _, _ in chosen]

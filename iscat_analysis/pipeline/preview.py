@@ -246,15 +246,7 @@ class RatioFilm:
         Shapes: result (y, x).
         """
         first, stop = self.frames
-        frame = min(max(frame, first), stop - 1)
-        step = frame - self._at
-        if self._at < 0 or abs(step) > self._window // 2:
-            self._sum_anew(frame)
-        else:
-            while self._at < frame:
-                self._forward()
-            while self._at > frame:
-                self._backward()
+        self._sum_around(min(max(frame, first), stop - 1))
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(self._after / self._before - 1.0)
 
@@ -305,26 +297,18 @@ class RatioFilm:
         counts /= light
         return counts
 
-    def _sum_anew(self, frame: int) -> None:
-        self._before[:], self._after[:] = 0.0, 0.0
-        for number in range(frame - self._window, frame):
-            self._before += self._frame(number)
-        for number in range(frame, frame + self._window):
-            self._after += self._frame(number)
+    def _sum_around(self, frame: int) -> None:
+        """Sum the frames before one and from it on, from the last sums where these are near."""
+        window, last, self._at = self._window, self._at, -1  # an error leaves no sums
+        if last < 0 or abs(frame - last) > window // 2:
+            self._before[:], self._after[:] = 0.0, 0.0
+            for number in range(window):
+                self._before += self._frame(frame - window + number)
+                self._after += self._frame(frame + number)
+        else:
+            sign = 1.0 if frame > last else -1.0
+            for number in range(min(last, frame), max(last, frame)):
+                passing = self._frame(number)
+                self._before += sign * (passing - self._frame(number - window))
+                self._after += sign * (self._frame(number + window) - passing)
         self._at = frame
-
-    def _forward(self) -> None:
-        passing = self._frame(self._at)
-        self._before += passing
-        self._before -= self._frame(self._at - self._window)
-        self._after += self._frame(self._at + self._window)
-        self._after -= passing
-        self._at += 1
-
-    def _backward(self) -> None:
-        self._at -= 1
-        passing = self._frame(self._at)
-        self._before -= passing
-        self._before += self._frame(self._at - self._window)
-        self._after += passing
-        self._after -= self._frame(self._at + self._window)

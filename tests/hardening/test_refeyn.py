@@ -25,7 +25,7 @@ from tiff_files import movie
 import iscat_analysis as ia
 from iscat_analysis.answers.calibrations import read_contrasts
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie import datasets as refeyn_module
+from iscat_analysis.movie import hdf5 as refeyn_module
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.event_tables import TABLE_COLUMNS, read_events
 

@@ -24,9 +24,8 @@ from iscat_analysis.fitting import events as events_module
 from iscat_analysis.fitting.ranges import background_mode
 from iscat_analysis.fitting.run import Run, partial_folder
 from iscat_analysis.landing import chunks as chunk_work
-from iscat_analysis.landing import merging
+from iscat_analysis.landing.chunks import FinishedChunk, MergedChunks
 from iscat_analysis.landing.find import analyse_landings, drift_findings
-from iscat_analysis.landing.merging import FinishedChunk, MergedChunks
 from iscat_analysis.landing.steps import ChunkFitter
 from iscat_analysis.landing.tasks import TaskBuilder
 from iscat_analysis.movie import open_stack
@@ -385,9 +384,8 @@ def test_what_is_shown_of_events_is_made_of_the_first_alone(
     counts: np.ndarray, plain: tuple[Any, list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.004)
-    for module in (merging, chunk_work):
-        monkeypatch.setattr(module, "VIEWS", 2)
-        monkeypatch.setattr(module, "CLIPS", 1)
+    monkeypatch.setattr(chunk_work, "VIEWS", 2)
+    monkeypatch.setattr(chunk_work, "CLIPS", 1)
     real, made = ChunkFitter.shown, []
 
     def shown(self: ChunkFitter, fitted: Any, clips: int) -> Any:

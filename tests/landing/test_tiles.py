@@ -20,7 +20,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.inference.nuisances import NOTHING
 from iscat_analysis.landing import chunks as chunk_work
-from iscat_analysis.landing import merging, neighbours, steps
+from iscat_analysis.landing import neighbours, steps
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.movie import open_stack
 from iscat_analysis.records import FRAME_COLUMN
@@ -139,12 +139,12 @@ def test_rows_of_one_step_are_found_among_those_of_its_frames() -> None:
         name: np.concatenate([value, value + rng.integers(-3, 4, 300) * (name != "mass_kda") / 2])
         for name, value in there.items()
     })  # fmt: skip
-    same = merging.SameSteps(table)
+    same = chunk_work.SameSteps(table)
     found = 0
     for one in range(600):
         frame, error, x, y, mass = (table[name].to_numpy(float) for name in there)
         near = np.abs(frame - frame[one]) <= np.maximum(2, error + error[one])
-        near &= np.hypot(x - x[one], y - y[one]) < merging.SEAM_PX
+        near &= np.hypot(x - x[one], y - y[one]) < chunk_work.SEAM_PX
         near &= mass * mass[one] > 0
         near[one] = False
         assert sorted(same.like(one)) == np.flatnonzero(near).tolist()
@@ -244,15 +244,15 @@ def test_a_particle_on_a_seam_is_reported_once() -> None:
             "y_nm": 1.0, "x_nm": 1.0}  # fmt: skip
     for left, right in ((49.3, 49.6), (49.6, 49.3), (49.7, 49.8)):
         tables = [pd.DataFrame([rows | {"x_px": x}]) for x in (left, right)]
-        assert len(merging.joined(tiles, [_finished(table) for table in tables]).lines) == 1
+        assert len(chunk_work.joined(tiles, [_finished(table) for table in tables]).lines) == 1
     apart = [pd.DataFrame([rows | {"x_px": x}]) for x in (47.0, 50.2)]
-    assert len(merging.joined(tiles, [_finished(table) for table in apart]).lines) == 2
+    assert len(chunk_work.joined(tiles, [_finished(table) for table in apart]).lines) == 2
 
 
-def _finished(lines: pd.DataFrame) -> merging.FinishedChunk:
+def _finished(lines: pd.DataFrame) -> chunk_work.FinishedChunk:
     """Make the results of half of a field that found one step."""
     none = np.zeros((100, 50), dtype=bool)
-    return merging.FinishedChunk(
+    return chunk_work.FinishedChunk(
         core=(0, 100), lines=lines, repeats=np.zeros((1, 4)), evidence=np.zeros((1, len(NOTHING))),
         views=(), good=np.ones(100, dtype=bool), light=np.ones(100), masked=none, saturated=none,
         strongest=np.zeros((2, 100, 50)), ends_e=np.empty(0),
