@@ -18,7 +18,11 @@ def assert_whole(address: Path | str, expected: np.ndarray = COUNTS) -> None:
     with open_stack(address) as stack:
         assert stack.shape == expected.shape
         assert stack.dtype == expected.dtype.newbyteorder("=")
-        assert np.array_equal(stack.read(0, len(expected)), expected)
+        block = stack.read(0, len(expected))
+        assert np.array_equal(block, expected)
+        assert block.dtype.isnative
+        assert block.flags.owndata
+        assert block.flags.writeable
         assert np.array_equal(stack.read(2, 5), expected[2:5])
         assert stack.read(3, 3).shape == (0, *expected.shape[1:])
 

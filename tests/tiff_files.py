@@ -102,6 +102,20 @@ def pages_of(data: NDArray, order: str = "<") -> list[bytes]:
     return [frame.astype(frame.dtype.newbyteorder(order)).tobytes() for frame in data]
 
 
+def write_pages(
+    path: Path,
+    data: NDArray,
+    *,
+    tags: Tags | None = None,
+    page_tags: Mapping[int, Tags] | None = None,
+    loop: bool = False,
+    gap: int = 0,
+) -> Path:
+    """Write a page for each frame; see `write_tiff`."""
+    given = {"tags": tags, "page_tags": page_tags, "loop": loop, "gap": gap}
+    return write_tiff(path, pages_of(data), data.shape[1:], **given)  # type: ignore[arg-type]
+
+
 def write_micro_manager(
     path: Path,
     data: NDArray,
@@ -114,7 +128,7 @@ def write_micro_manager(
     }
     if description is not None:
         page_tags.setdefault(0, {})[270] = (ASCII, description)
-    return write_tiff(path, pages_of(data), data.shape[1:], page_tags=page_tags)
+    return write_pages(path, data, page_tags=page_tags)
 
 
 def write_stk(

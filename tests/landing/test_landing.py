@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tifffile
+from landings import CAMERA, PIXEL_NM, Found, analysed, drawn, landing_config, simulating
 from scenes import Stack
 
 from iscat_analysis.camera import Camera
@@ -37,7 +38,6 @@ from iscat_analysis.search import chunks as chunks_module
 from iscat_analysis.search import chunks as planning
 from iscat_analysis.study import Movie
 
-PIXEL_NM = 84.0
 SIDE, FRAMES = 64, 420
 EVENTS = [
     (80, None, 20.3, 21.7, 480.0),
@@ -47,29 +47,9 @@ EVENTS = [
 ]
 
 
-def _config(*settings: str, **sections: Any) -> Config:
-    base = [
-        f"camera.pixel_size_nm={PIXEL_NM}",
-        "camera.gain_e_per_adu=4.0",
-        "particle.mass_kda=146.0",
-        "calibration.gradient_per_kda=-3.1e-5",
-        f"simulation.shape=[{SIDE}, {SIDE}]",
-        f"simulation.frames={FRAMES}",
-        "simulation.photons_per_pixel=1e5",
-        "simulation.background=speckle",
-        "simulation.power_noise=0.01",
-        "background.window_frames=40",
-        "detection.false_alarms_per_movie=0.01",
-    ]
-    config = load_config(None, [*base, *settings])
-    events = [
-        dict(zip(("frame", "leave", "x_px", "y_px", "mass_kda"), e, strict=True))
-        for e in sections.get("events", EVENTS)
-    ]
-    simulation = type(config.simulation).model_validate(
-        {**config.simulation.model_dump(), "events": events}
-    )
-    return config.model_copy(update={"simulation": simulation})
+def _config(*settings: str, events: Any = EVENTS) -> Config:
+    alarms = "detection.false_alarms_per_movie=0.01"
+    return landing_config(SIDE, FRAMES, alarms, *settings, events=events)
 
 
 class Memory(Stack):
@@ -90,16 +70,11 @@ class Memory(Stack):
 @pytest.fixture(scope="module")
 def counts() -> np.ndarray:
     """Draw the movie of `EVENTS` once."""
-    return np.array(list(Movie(_config(), 1).frames(2)))
+    return drawn(_config())
 
 
-def _run(counts: np.ndarray, config: Config | None = None, **options: Any) -> tuple[Any, list[str]]:
-    told: list[str] = []
-    result = analyse_landings(
-        Memory(counts), config or _config(), options.pop("camera", Camera(gain_e_per_adu=4.0)),
-        Run(told.append, **options),
-    )  # fmt: skip
-    return result, told
+def _run(counts: np.ndarray, config: Config | None = None, **options: Any) -> Found:
+    return analysed(Memory(counts), config or _config(), **options)
 
 
 STEPS = sorted(
@@ -132,12 +107,12 @@ def _assert_all_found(table: pd.DataFrame, *, frames: int = 1, sigmas: float = 4
 
 
 @pytest.fixture(scope="module")
-def plain(counts: np.ndarray) -> tuple[Any, list[str]]:
+def plain(counts: np.ndarray) -> Found:
     """Analyse it once."""
     return _run(counts)
 
 
-def test_every_step_is_found_dated_and_weighed(plain: tuple[Any, list[str]]) -> None:
+def test_every_step_is_found_dated_and_weighed(plain: Found) -> None:
     result, told = plain
     assert told == []
     table = result.fits
@@ -154,7 +129,7 @@ def test_every_step_is_found_dated_and_weighed(plain: tuple[Any, list[str]]) -> 
     assert all(view.posterior is None for view in result.views)  # the configuration asks for none
 
 
-def test_the_bound_is_that_of_the_frames_used(plain: tuple[Any, list[str]]) -> None:
+def test_the_bound_is_that_of_the_frames_used(plain: Found) -> None:
     """n_b n_a/(n_b + n_a) frames inform: the 480 kDa steps differ by their windows alone."""
     table = plain[0].fits
     heavy = table[table["mass_kda"].abs() > 300]
@@ -166,7 +141,7 @@ def test_the_bound_is_that_of_the_frames_used(plain: tuple[Any, list[str]]) -> N
 
 
 def test_nothing_is_found_in_a_blank_movie() -> None:
-    blank = np.array(list(Movie(_config(events=[]), 2).frames(2)))
+    blank = drawn(_config(events=[]), 2)
     result, told = _run(blank)
     assert len(result.fits) == 0
     assert list(result.fits.columns) == [*EVENT_COLUMNS, FRAME_COLUMN]
@@ -174,12 +149,10 @@ def test_nothing_is_found_in_a_blank_movie() -> None:
     assert told == []
 
 
-def test_chunks_change_nothing_but_the_last_digits(
-    counts: np.ndarray, plain: tuple[Any, list[str]]
-) -> None:
+def test_chunks_change_nothing_but_the_last_digits(counts: np.ndarray, plain: Found) -> None:
     config = _config("compute.memory_limit_mb=64")
     movie = Memory(np.tile(counts, (4, 1, 1)))
-    cut = analyse_landings(movie, config, Camera(gain_e_per_adu=4.0), Run())
+    cut = analyse_landings(movie, config, CAMERA, Run())
     assert cut.summary["chunks"] > 1
     spans = sorted(set(movie.reads))
     assert sum(b - a for a, b in spans) <= 4 * FRAMES + 2 * 400  # the noise curve reads again
@@ -212,7 +185,7 @@ def _misfit(view: EventView, factor: float = 1.0) -> float:
     return float(max(*means, abs((residual**2).mean() - 1) * np.sqrt(residual.size / 2)))
 
 
-def test_a_trace_is_a_step_of_the_height_that_was_fitted(plain: tuple[Any, list[str]]) -> None:
+def test_a_trace_is_a_step_of_the_height_that_was_fitted(plain: Found) -> None:
     result = plain[0]
     for view, row in zip(result.views, result.fits.itertuples(), strict=True):
         trace = view.trace
@@ -230,13 +203,13 @@ def test_a_trace_is_a_step_of_the_height_that_was_fitted(plain: tuple[Any, list[
 def test_a_trace_is_of_one_particle_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     events = [(150, None, 28.2, 31.6, 146.0), (195, None, 35.2, 31.6, 480.0)]
     config = _config(events=events)
-    counts = np.array(list(Movie(config, 5).frames(2)))
+    counts = drawn(config, 5)
     assert all(_misfit(view) < 4.5 for view in _run(counts, config)[0].views)
     monkeypatch.setattr(TaskBuilder, "added", lambda *_: 0.0)
     assert _misfit(_run(counts, config)[0].views[0]) > 6.0
 
 
-def test_a_clip_rises_to_the_step_and_falls(plain: tuple[Any, list[str]]) -> None:
+def test_a_clip_rises_to_the_step_and_falls(plain: Found) -> None:
     for view in plain[0].views:
         clip, trace = view.clip, view.trace
         assert clip.window_frames == 40
@@ -253,10 +226,8 @@ def test_a_clip_rises_to_the_step_and_falls(plain: tuple[Any, list[str]]) -> Non
 
 def test_fine_pixels_of_a_clip_are_summed() -> None:
     config = _config("camera.pixel_size_nm=28", "fit.roi_nm=1200", events=[(90, None, 30, 32, 480)])
-    config = config.model_copy(
-        update={"simulation": config.simulation.model_copy(update={"frames": 180})}
-    )
-    (view,) = _run(np.array(list(Movie(config, 1).frames(2))), config)[0].views
+    config = simulating(config, frames=180)
+    (view,) = _run(drawn(config), config)[0].views
     assert view.clip.contrast.shape[1:] == (21, 21)
     at = view.clip.frames.index(view.trace.frame)
     assert view.clip.contrast[at].min() == pytest.approx(view.trace.after, rel=0.2)
@@ -268,7 +239,7 @@ def test_fine_pixels_of_a_clip_are_summed() -> None:
 def _close(second_frame: int, distance_px: float) -> pd.DataFrame:
     events = [(150, None, 30.2, 31.6, 480.0), (second_frame, None, 30.2 + distance_px, 31.6, 480.0)]
     config = _config(events=events)
-    return _run(np.array(list(Movie(config, 5).frames(2))), config)[0].fits
+    return _run(drawn(config, 5), config)[0].fits
 
 
 def test_a_window_ends_where_a_close_neighbour_lands() -> None:
@@ -285,7 +256,7 @@ def test_a_window_ends_where_a_close_neighbour_lands() -> None:
 def test_a_short_visit_is_weighed_while_it_lasts(land: int, leave: int) -> None:
     """Where one step is dated anew, the other's window has to follow."""
     config = _config("background.window_frames=100", events=[(land, leave, 30.2, 31.7, 480.0)])
-    table = _run(np.array(list(Movie(config, land).frames(2))), config)[0].fits
+    table = _run(drawn(config, land), config)[0].fits
     assert table["frame"].tolist() == [land, leave]
     assert table["n_after"].tolist() == [leave - land, 100]
     assert table["n_before"].tolist() == [100, leave - land]
@@ -344,7 +315,7 @@ def test_frames_behind_a_closed_shutter_are_left_out(counts: np.ndarray) -> None
 
 @pytest.mark.parametrize(("polarity", "sign"), [("dark", 1), ("bright", -1)])
 def test_one_polarity_is_that_part_of_both(
-    counts: np.ndarray, plain: tuple[Any, list[str]], polarity: str, sign: int
+    counts: np.ndarray, plain: Found, polarity: str, sign: int
 ) -> None:
     table = plain[0].fits
     found = _run(counts, _config(f"detection.polarity={polarity}"))[0].fits
@@ -358,7 +329,7 @@ def test_what_was_injected_is_looked_for_in_the_polarity_that_is_reported(
     counts: np.ndarray,
 ) -> None:
     config = _config("detection.polarity=dark")
-    camera = Camera(gain_e_per_adu=4.0)
+    camera = CAMERA
     result, _ = _run(counts, config)
     found = inject_and_recover(_ready(counts, camera), Run(inject=3), result)
     assert found["added"] == 3
@@ -381,7 +352,7 @@ def test_pulls_of_injected_particles_are_in_units_of_the_errors_that_are_reporte
 
 
 def test_what_is_shown_of_events_is_made_of_the_first_alone(
-    counts: np.ndarray, plain: tuple[Any, list[str]], monkeypatch: pytest.MonkeyPatch
+    counts: np.ndarray, plain: Found, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.004)
     monkeypatch.setattr(chunk_work, "VIEWS", 2)
@@ -404,7 +375,7 @@ def test_what_is_shown_of_events_is_made_of_the_first_alone(
 
 
 def test_lines_of_chunks_have_no_numbers(
-    counts: np.ndarray, plain: tuple[Any, list[str]], monkeypatch: pytest.MonkeyPatch
+    counts: np.ndarray, plain: Found, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A row is numbered when it is made, and that is when all chunks are there."""
     monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.005)
@@ -540,10 +511,9 @@ def test_rings_of_neighbours_are_those_of_their_height(mode: str) -> None:
         f"fit.mode={mode}", "particle.mass_kda=2000", "simulation.frames=140",
         "simulation.photons_per_pixel=2e5", "simulation.background=flat", events=events,
     )  # fmt: skip
-    raised = [event.model_copy(update={"z_nm": 30.0}) for event in config.simulation.events]
-    simulation = config.simulation.model_copy(update={"events": raised})
-    movie = Movie(config.model_copy(update={"simulation": simulation}), 1)
-    table = _run(np.array(list(movie.frames(2))), config)[0].fits.sort_values("frame")
+    raised = [event.model_dump() | {"z_nm": 30.0} for event in config.simulation.events]
+    counts = drawn(simulating(config, events=raised))
+    table = _run(counts, config)[0].fits.sort_values("frame")
     assert table["status"].tolist() == ["ok", "ok"]
     for row, (_, _, x, y, _) in zip(table.itertuples(), events, strict=True):
         assert abs(row.x_nm - x * PIXEL_NM) < 4.5 * row.sigma_x_nm
@@ -647,7 +617,7 @@ RATE = (0.004, -0.003)
 def drifting() -> np.ndarray:
     """Draw the movie of `EVENTS` once more, with the sample drifting."""
     config = _config(f"simulation.drift_px_per_frame={list(RATE)}")
-    return np.array(list(Movie(config, 1).frames(2)))
+    return drawn(config)
 
 
 CORRECTED = "background.drift_correction=true"
@@ -664,12 +634,12 @@ def _assert_moved(table: pd.DataFrame) -> None:
 
 
 @pytest.fixture(scope="module")
-def followed(drifting: np.ndarray) -> tuple[Any, list[str]]:
+def followed(drifting: np.ndarray) -> Found:
     """Analyse it with its drift corrected."""
     return _run(drifting, _config(CORRECTED))
 
 
-def test_a_drifting_movie_is_analysed_as_a_still_one(followed: tuple[Any, list[str]]) -> None:
+def test_a_drifting_movie_is_analysed_as_a_still_one(followed: Found) -> None:
     result, told = followed
     _assert_moved(result.fits)
     assert set(result.fits["status"]) == {"ok"}
@@ -686,9 +656,7 @@ def test_a_drifting_movie_is_analysed_as_a_still_one(followed: tuple[Any, list[s
     assert landing["drift_px"] == [landing["drift_y_px"][-1], landing["drift_x_px"][-1]]
 
 
-def test_its_result_does_not_depend_on_the_workers(
-    drifting: np.ndarray, followed: tuple[Any, list[str]]
-) -> None:
+def test_its_result_does_not_depend_on_the_workers(drifting: np.ndarray, followed: Found) -> None:
     alone, _ = _run(drifting, _config(CORRECTED, "compute.workers=1"))
     pd.testing.assert_frame_equal(alone.fits, followed[0].fits)
 
@@ -701,7 +669,7 @@ def cut(drifting: np.ndarray) -> Any:
         return _run(drifting, _config(CORRECTED, "compute.workers=1"))[0]
 
 
-def test_its_chunks_agree(cut: Any, followed: tuple[Any, list[str]]) -> None:
+def test_its_chunks_agree(cut: Any, followed: Found) -> None:
     assert cut.summary["chunks"] > 1
     _assert_moved(cut.fits)
     whole = followed[0]
@@ -714,7 +682,7 @@ def test_its_chunks_agree(cut: Any, followed: tuple[Any, list[str]]) -> None:
 
 
 def test_where_nothing_drifts_the_correction_changes_nothing(
-    counts: np.ndarray, plain: tuple[Any, list[str]]
+    counts: np.ndarray, plain: Found
 ) -> None:
     result, told = _run(counts, _config(CORRECTED))
     _assert_all_found(result.fits)
@@ -726,9 +694,8 @@ def test_where_nothing_drifts_the_correction_changes_nothing(
 
 
 def test_without_a_pattern_there_is_nothing_to_correct() -> None:
-    config = _config(CORRECTED, "simulation.background=flat")
-    short = replace_frames(config, 160)
-    result, told = _run(np.array(list(Movie(short, 1).frames(2))), short)
+    short = _config(CORRECTED, "simulation.background=flat", "simulation.frames=160")
+    result, told = _run(drawn(short), short)
     assert not result.summary["drift_corrected"]
     assert result.summary["drift_x_px"] is None
     assert any("no fixed pattern" in line for line in told)
@@ -749,7 +716,7 @@ def test_chains_reach_the_report(movie: Path, tmp_path: Path) -> None:
 
 
 def test_an_interrupt_of_the_chains_keeps_the_fits(
-    counts: np.ndarray, plain: tuple[Any, list[str]], monkeypatch: pytest.MonkeyPatch
+    counts: np.ndarray, plain: Found, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
@@ -821,7 +788,7 @@ def test_a_corrected_run_resumes_to_the_same_result(
         assert asdict(view.trace) | same == asdict(other.trace) | same
 
 
-def test_injected_particles_drift_along(followed: tuple[Any, list[str]]) -> None:
+def test_injected_particles_drift_along(followed: Found) -> None:
     from iscat_analysis.pipeline.landings import Injected, InjectedMovie
 
     way = followed[0].trajectory
@@ -829,7 +796,7 @@ def test_injected_particles_drift_along(followed: tuple[Any, list[str]]) -> None
     spot = -0.3 * np.exp(-(x**2 + y**2) / 8)
     flat = Memory(np.full((FRAMES, SIDE, SIDE), 25000, dtype="u2"))
     movie = InjectedMovie(
-        flat, Camera(gain_e_per_adu=4.0), [Injected(50, FRAMES, 30.0, 30.0, 1.0, (15, 15), spot)],
+        flat, CAMERA, [Injected(50, FRAMES, 30.0, 30.0, 1.0, (15, 15), spot)],
         1, way,
     )  # fmt: skip
     late = 350
@@ -852,9 +819,3 @@ def test_injection_needs_sliding_windows(movie: Path) -> None:
     config = _config("background.frames=[0, 60]", "posterior.enabled=false")
     with open_stack(movie) as stack, pytest.raises(ConfigError, match="`inject` = "):
         analyse(stack, config, inject=8)
-
-
-def replace_frames(config: Config, frames: int) -> Config:
-    """Shorten the simulated movie."""
-    simulation = config.simulation.model_copy(update={"frames": frames})
-    return config.model_copy(update={"simulation": simulation})

@@ -8,24 +8,20 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from scenes import Stack
+from landings import PIXEL_NM, analysed, landing_config
 from scipy.ndimage import convolve1d
 from scipy.stats import poisson
 
-from iscat_analysis.camera import Camera
-from iscat_analysis.config import Config, load_config
+from iscat_analysis.config import Config
 from iscat_analysis.fitting.context import make_context
-from iscat_analysis.fitting.run import Run
 from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import FRAME_COLUMN, Candidate
 from iscat_analysis.study import Movie
 
 pytestmark = pytest.mark.large
 
-PIXEL_NM = 84.0
 LEVEL_E = 1e5
 WINDOW = 40
 SIGMAS = 4.0
@@ -44,31 +40,8 @@ def _moving(drift: tuple[float, float]) -> list[str]:
     ]
 
 
-def _config(side: int, frames: int, *settings: str) -> Config:
-    return load_config(
-        None,
-        [
-            f"camera.pixel_size_nm={PIXEL_NM}",
-            "camera.gain_e_per_adu=4.0",
-            "particle.mass_kda=146.0",
-            "calibration.gradient_per_kda=-3.1e-5",
-            f"simulation.shape=[{side}, {side}]",
-            f"simulation.frames={frames}",
-            f"simulation.photons_per_pixel={LEVEL_E}",
-            "simulation.background=speckle",
-            "simulation.power_noise=0.01",
-            f"background.window_frames={WINDOW}",
-            *settings,
-        ],
-    )
-
-
 def _analyse(config: Config, seed: int) -> pd.DataFrame:
-    counts = np.array(list(Movie(config, seed).frames()))
-    return analyse_landings(
-        Stack(counts), config, Camera(gain_e_per_adu=4.0),
-        Run(),
-    ).fits  # fmt: skip
+    return analysed(np.array(list(Movie(config, seed).frames())), config)[0].fits
 
 
 # ---- blank movies ----------------------------------------------------------------------------
@@ -80,7 +53,7 @@ BLANK = ["detection.false_alarms_per_movie=1.0", "fit.roi_nm=1800.0"]
 @pytest.fixture(scope="module", params=[STILL, DRIFTING], ids=["still", "drifting"])
 def alarms(request: pytest.FixtureRequest) -> tuple[int, int]:
     """Events found in blank movies at 1 expected in each, and the number of movies."""
-    config = _config(64, 240, *BLANK, *_moving(request.param))
+    config = landing_config(64, 240, *BLANK, *_moving(request.param))
     movies = 64
     return sum(len(_analyse(config, seed)) for seed in range(movies)), movies
 
@@ -97,7 +70,7 @@ def test_false_alarms_are_as_many_as_configured(alarms: tuple[int, int]) -> None
 def test_drift_that_is_not_corrected_is_taken_for_particles() -> None:
     """Control: of the false alarms above, and of the speed of the drift."""
     short = ["background.window_frames=10", "background.drift_correction=false"]
-    config = _config(32, 50, *BLANK, *_moving(DRIFTING), *short)
+    config = landing_config(32, 50, *BLANK, *_moving(DRIFTING), *short)
     with pytest.raises(AssertionError):
         _assert_expected(len(_analyse(config, 1)), 1)
 
@@ -132,17 +105,13 @@ KINDS = ("lagged", "leaky", "read", "gain", "rows", "columns")
 
 def _alarms_in(kind: str, movies: int) -> int:
     """Count events in blank movies, 1 expected in each, with a kind of noise."""
-    config, found = _config(64, 240, *BLANK), 0
+    config, found = landing_config(64, 240, *BLANK), 0
     for seed in range(movies):
         light = np.array(list(Movie(config, seed).expected_frames()))
         drawn = np.random.default_rng(seed).poisson(light)
         counts = np.round(_with_noise(drawn, light, kind, seed) / 4.0)
-        found += len(
-            analyse_landings(
-                Stack(np.clip(counts, 0, 65535).astype(np.uint16)), config,
-                Camera(gain_e_per_adu=4.0), Run(),
-            ).fits
-        )  # fmt: skip
+        result, _ = analysed(np.clip(counts, 0, 65535).astype(np.uint16), config)
+        found += len(result.fits)
     return found
 
 
@@ -190,11 +159,8 @@ def events(request: pytest.FixtureRequest) -> pd.DataFrame:
                 )
         # those of noise are counted above
         alarms = "detection.false_alarms_per_movie=1e-3"
-        config = _config(115, 260, *_moving(request.param), alarms)
-        simulation = type(config.simulation).model_validate(
-            {**config.simulation.model_dump(), "events": placed}
-        )
-        table = _analyse(config.model_copy(update={"simulation": simulation}), seed)
+        config = landing_config(115, 260, *_moving(request.param), alarms, events=placed)
+        table = _analyse(config, seed)
         for truth in placed:
             for sign, when in ((1, truth["frame"]), (-1, truth["leave"])):
                 if when is None:
@@ -264,7 +230,7 @@ def test_frames_lie_in_their_intervals(events: pd.DataFrame) -> None:
 @pytest.fixture(scope="module")
 def biases() -> tuple[np.ndarray, np.ndarray]:
     """Relative errors of a faint particle's mass, with and without the correction."""
-    config = _config(64, 200)
+    config = landing_config(64, 200)
     context = make_context(config, (64, 64), sliding=True)
     grid = PixelGrid.region((0, context.roi_px), (0, context.roi_px), PIXEL_NM)
     x, y, mass = 15.3, 15.8, 66.0

@@ -10,20 +10,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from landings import PIXEL_NM, Found, analysed, drawn, landing_config
 
 import iscat_analysis as ia
-from iscat_analysis.camera import Camera
-from iscat_analysis.config import Config, load_config
-from iscat_analysis.fitting.run import Run
+from iscat_analysis.config import Config
 from iscat_analysis.instrument.uneven import is_plausible
 from iscat_analysis.landing import steps as steps_module
-from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.landing.maps import LEVELS, Searched
 from iscat_analysis.landing.measured_images import ring_average
 from iscat_analysis.species import Efficiency
-from iscat_analysis.study import Movie
 
-PIXEL_NM, SIDE, FRAMES = 84.0, 112, 240
+SIDE, FRAMES = 112, 240
 VESICLE = (120, 55.3, 54.1, 8000.0)  # frame, x, y [px], mass [kDa]
 RADIUS_NM, POINTS = 50.0, 14
 AWAY_PX = 2000 / PIXEL_NM
@@ -54,45 +51,15 @@ def _vesicle(frame: int, x_px: float, y_px: float, mass_kda: float) -> list[dict
 
 
 def _config(*, vesicle: bool) -> Config:
-    config = load_config(
-        None,
-        [
-            f"camera.pixel_size_nm={PIXEL_NM}", "camera.gain_e_per_adu=4.0",
-            "particle.mass_kda=146.0", "calibration.gradient_per_kda=-3.1e-5",
-            f"simulation.shape=[{SIDE}, {SIDE}]", f"simulation.frames={FRAMES}",
-            "simulation.photons_per_pixel=1e5", "simulation.background=speckle",
-            "background.window_frames=40", "detection.false_alarms_per_movie=0.01",
-        ],
-    )  # fmt: skip
     names = ("frame", "x_px", "y_px", "mass_kda")
     events: list[dict[str, Any]] = [dict(zip(names, each, strict=True)) for each in PROTEINS]
     events += _vesicle(*VESICLE) if vesicle else []
-    simulation = type(config.simulation).model_validate(
-        {**config.simulation.model_dump(), "events": events}
-    )
-    return config.model_copy(update={"simulation": simulation})
+    settings = "simulation.power_noise=0", "detection.false_alarms_per_movie=0.01"
+    return landing_config(SIDE, FRAMES, *settings, events=events)
 
 
-class _Memory:
-    """A movie in memory."""
-
-    name = "movie"
-
-    def __init__(self, counts: np.ndarray) -> None:
-        self.counts, self.shape, self.dtype = counts, counts.shape, counts.dtype
-
-    def read(self, start: int, stop: int) -> np.ndarray:
-        """Frames [start, stop)."""
-        return self.counts[start:stop].copy()
-
-
-def _analysed(counts: np.ndarray) -> tuple[Any, list[str]]:
-    told: list[str] = []
-    result = analyse_landings(
-        _Memory(counts), _config(vesicle=True), Camera(gain_e_per_adu=4.0),
-        Run(notify=told.append),
-    )  # fmt: skip
-    return result, told
+def _analysed(counts: np.ndarray) -> Found:
+    return analysed(counts, _config(vesicle=True))
 
 
 def _recovered(table: pd.DataFrame) -> int:
@@ -119,7 +86,7 @@ def _false(table: pd.DataFrame) -> int:
 @pytest.fixture(scope="module")
 def bright() -> np.ndarray:
     """Draw proteins that land with a vesicle among them."""
-    return np.array(list(Movie(_config(vesicle=True), 1).frames(2)))
+    return drawn(_config(vesicle=True), 1)
 
 
 def test_proteins_that_land_with_a_vesicle_have_rows(bright: np.ndarray) -> None:
@@ -145,7 +112,7 @@ def test_without_its_own_picture_it_hides_the_field_and_that_is_said(
 
 
 def test_a_movie_without_bright_things_is_searched_as_a_whole() -> None:
-    result, told = _analysed(np.array(list(Movie(_config(vesicle=False), 2).frames(2))))
+    result, told = _analysed(drawn(_config(vesicle=False), 2))
     assert _recovered(result.fits) == len(PROTEINS)
     assert result.summary["searched_share"] == 1.0
     assert result.summary["partly_searched"] == []

@@ -12,23 +12,20 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from scenes import Stack
+from landings import analysed, drawn, landing_config
 
 from iscat_analysis.camera import Camera, measure_spectrum
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.run import Run
 from iscat_analysis.inference.nuisances import NOTHING
 from iscat_analysis.landing import chunks as chunk_work
 from iscat_analysis.landing import neighbours, steps
-from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.movie import open_stack
 from iscat_analysis.records import FRAME_COLUMN
 from iscat_analysis.search import chunks as chunks_module
 from iscat_analysis.search import chunks as planning
 from iscat_analysis.search.chunks import Reader
 from iscat_analysis.search.frames import Tile, cut_field, frames_in_place
-from iscat_analysis.study import Movie
 from iscat_analysis.threads import threads
 
 SIDE, FRAMES = 176, 130
@@ -44,33 +41,21 @@ EVENTS = [
 ]
 
 
-def _config(*settings: str) -> Config:
-    base = [
-        "camera.pixel_size_nm=84.0", "camera.gain_e_per_adu=4.0", "particle.mass_kda=146.0",
-        "calibration.gradient_per_kda=-3.1e-5", f"simulation.shape=[{SIDE}, {SIDE}]",
-        f"simulation.frames={FRAMES}", "simulation.photons_per_pixel=1e5",
-        "simulation.background=speckle", "simulation.power_noise=0.01",
+def _config() -> Config:
+    settings = [
         "background.window_frames=30", "detection.false_alarms_per_movie=0.01", "fit.roi_nm=1000",
     ]  # fmt: skip
-    config = load_config(None, [*base, *settings])
-    names = ("frame", "leave", "x_px", "y_px", "mass_kda")
-    events = [dict(zip(names, event, strict=True)) for event in EVENTS]
-    simulation = type(config.simulation).model_validate(
-        {**config.simulation.model_dump(), "events": events}
-    )
-    return config.model_copy(update={"simulation": simulation})
+    return landing_config(SIDE, FRAMES, *settings, events=EVENTS)
 
 
 @pytest.fixture(scope="module")
 def counts() -> np.ndarray:
     """Draw the movie of `EVENTS` once."""
-    return np.array(list(Movie(_config(), 1).frames(2)))
+    return drawn(_config())
 
 
-def _run(movie: Any, config: Config | None = None, **options: Any) -> Any:
-    return analyse_landings(
-        movie, config or _config(), Camera(gain_e_per_adu=4.0), Run(), **options,
-    )  # fmt: skip
+def _run(movie: Any) -> Any:
+    return analysed(movie, _config())[0]
 
 
 def _tiled(monkeypatch: pytest.MonkeyPatch, parts: tuple[int, int], core: int) -> None:
@@ -81,7 +66,7 @@ def _tiled(monkeypatch: pytest.MonkeyPatch, parts: tuple[int, int], core: int) -
 @pytest.fixture(scope="module")
 def whole(counts: np.ndarray) -> Any:
     """Analyse the field at once."""
-    return _run(Stack(counts))
+    return _run(counts)
 
 
 def _difference(found: Any, whole: Any) -> float:
@@ -167,7 +152,7 @@ def test_images_that_are_drawn_again_are_the_same(
     monkeypatch.setattr(neighbours.Neighbours, "__init__", watched)
     gc.disable()
     try:
-        found = _run(Stack(counts))
+        found = _run(counts)
         assert [one() for one in left] == [None, None]
     finally:
         gc.enable()
@@ -222,7 +207,7 @@ def test_tiles_and_chunks_of_frames_that_exceed_the_memory(
     """They are read once, into a temporary file."""
     _tiled(monkeypatch, parts, core)
     monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.002)
-    found = _run(Stack(counts))
+    found = _run(counts)
     assert found.summary["chunks"] == -(-FRAMES // core)
     _check(found, whole)
 
@@ -233,7 +218,7 @@ def test_without_halos_rows_change(
     """Control: particles on seams are cut in half."""
     _tiled(monkeypatch, (2, 2), FRAMES)
     monkeypatch.setattr(planning, "halo_px", lambda _: 6)
-    found = _run(Stack(counts))
+    found = _run(counts)
     assert len(found.fits) != len(whole.fits) or _difference(found, whole) > 0.1
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
-from tiff_files import ASCII, RATIONAL, SHORT, movie, pages_of, write_micro_manager, write_tiff
+from small_files import refused
+from tiff_files import ASCII, RATIONAL, SHORT, movie, write_micro_manager, write_pages
 
 from iscat_analysis.camera import learn_camera, resolve_metadata
 from iscat_analysis.config import CameraConfig, configure
@@ -29,16 +30,26 @@ OME = (
 def described(
     path: Path, text: str, *, frames: int = FRAMES, resolution: tuple | None = None
 ) -> Path:
-    data = movie(frames)
     tags: dict = {270: (ASCII, text)} if text else {}
     if resolution is not None:
         (x, y), unit = resolution
         tags |= {282: (RATIONAL, x), 283: (RATIONAL, y), 296: (SHORT, [unit])}
-    return write_tiff(path, pages_of(data), data.shape[1:], page_tags={0: tags})
+    return write_pages(path, movie(frames), page_tags={0: tags})
 
 
 def ome(path: Path, pixels: str = "", body: str = "", more: str = "") -> Path:
     return described(path, OME.format(pixels=pixels, body=body, more=more))
+
+
+def planes(times_ms: dict[int, float], more: str = "") -> str:
+    return "".join(
+        f'<Plane TheT="{t}" TheZ="0" TheC="0" DeltaT="{time}" DeltaTUnit="ms" {more}/>'
+        for t, time in times_ms.items()
+    )
+
+
+def imagej(path: Path, lines: str) -> StackMetadata:
+    return metadata(described(path, f"ImageJ=1.53t\nimages=5\n{lines}\n"))
 
 
 def metadata(path: Path) -> StackMetadata:
@@ -91,11 +102,7 @@ def test_ome_nonsense_is_ignored(path: Path, attributes: str) -> None:
 
 
 def test_ome_timing(path: Path) -> None:
-    body = "".join(
-        f'<Plane TheT="{t}" TheZ="0" TheC="0" DeltaT="{t * 5.0}" DeltaTUnit="ms" '
-        'ExposureTime="0.004"/>'
-        for t in (4, 0, 2)
-    )
+    body = planes({4: 20.0, 0: 0.0, 2: 10.0}, 'ExposureTime="0.004"')
     found = metadata(ome(path, body=body))
     assert found.frame_rate_hz == pytest.approx(200)
     assert found.exposure_ms == pytest.approx(4)
@@ -106,21 +113,17 @@ def test_ome_timing(path: Path) -> None:
 def test_times_of_ome_planes_are_preferred_to_the_interval_that_was_set(
     path: Path, increment: str, said: bool
 ) -> None:
-    body = "".join(
-        f'<Plane TheT="{t}" TheZ="0" TheC="0" DeltaT="{t * 5.0}" DeltaTUnit="ms"/>'
-        for t in range(5)
-    )
-    with open_stack(ome(path, f'TimeIncrement="{increment}" TimeIncrementUnit="ms"', body)) as m:
+    body, pixels = planes({t: 5.0 * t for t in range(5)}), f'TimeIncrement="{increment}"'
+    with open_stack(ome(path, f'{pixels} TimeIncrementUnit="ms"', body)) as m:
         assert m.metadata.frame_rate_hz == pytest.approx(200, rel=0.01)
         assert [("100 Hz" in note, "DeltaT" in note) for note in m.notes] == [(True, True)] * said
-    with open_stack(ome(path, f'TimeIncrement="{increment}" TimeIncrementUnit="ms"')) as m:
+    with open_stack(ome(path, f'{pixels} TimeIncrementUnit="ms"')) as m:
         assert m.metadata.frame_rate_hz == pytest.approx(1e3 / float(increment))
         assert not m.notes
 
 
 def test_pixels_must_be_square(path: Path) -> None:
-    with pytest.raises(DataError, match="84 nm in x and 85 nm in y"):
-        open_stack(ome(path, 'PhysicalSizeX="0.084" PhysicalSizeY="0.085"'))
+    refused(ome(path, 'PhysicalSizeX="0.084" PhysicalSizeY="0.085"'), "84 nm in x and 85 nm in y")
 
 
 @pytest.mark.parametrize(
@@ -129,8 +132,7 @@ def test_pixels_must_be_square(path: Path) -> None:
 )
 def test_ome_document_types_are_refused(path: Path, prolog: str) -> None:
     text = OME.format(pixels="", body="", more="").replace("?>", "?>" + prolog)
-    with pytest.raises(DataError, match="document type"):
-        open_stack(described(path, text))
+    refused(described(path, text), "document type")
 
 
 @pytest.mark.parametrize(
@@ -142,16 +144,14 @@ def test_ome_document_types_are_refused(path: Path, prolog: str) -> None:
         ('SizeT="5"', 'SizeT="9"', "describes 9 frames but the file holds 5"),
         ('SizeT="5"', 'SizeT="2"', "describes 2 frames but the file holds 5"),
         ('SizeT="5"', f'SizeT="{10**15}"', "describes 1000000000000000 frames"),
-        ('SizeC="1"', 'SizeC="2"', r"T \(time\) of length 5 and C \(channel\) of length 2"),
+        ('SizeC="1"', 'SizeC="2"', "T (time) of length 5 and C (channel) of length 2"),
         ("<Image", '<BinaryOnly MetadataFile="a.ome.tif"/><Image', "one part of an OME set"),
     ],
 )
 def test_ome_that_does_not_fit_is_refused(path: Path, old: str, new: str, message: str) -> None:
     text = OME.format(pixels="", body="", more="")
     assert old in text
-    with pytest.raises(DataError, match=message) as error:
-        open_stack(described(path, text.replace(old, new)))
-    assert "\n" not in str(error.value)
+    refused(described(path, text.replace(old, new)), message)
 
 
 def test_ome_orders_the_frames(path: Path) -> None:
@@ -170,8 +170,7 @@ def test_ome_orders_the_frames(path: Path) -> None:
     ],
 )
 def test_ome_must_cover_every_image_once(path: Path, body: str) -> None:
-    with pytest.raises(DataError, match="OME-XML"):
-        open_stack(ome(path, body=body))
+    refused(ome(path, body=body), "OME-XML")
 
 
 def test_ome_sets_without_their_files_are_refused(path: Path) -> None:
@@ -180,8 +179,7 @@ def test_ome_sets_without_their_files_are_refused(path: Path) -> None:
         "</TiffData>"
         for t in range(5)
     )
-    with pytest.raises(DataError, match=r"one of 5 files of a movie, of which part0\.ome\.tif"):
-        open_stack(ome(path, body=body))
+    refused(ome(path, body=body), "one of 5 files of a movie, of which part0.ome.tif")
 
 
 def test_a_renamed_ome_file_is_read(path: Path) -> None:
@@ -195,8 +193,7 @@ def test_a_renamed_ome_file_is_read(path: Path) -> None:
 
 def test_ome_series_are_refused(path: Path) -> None:
     more = OME[OME.index("<Image") : OME.index("{more}")].format(pixels="", body="")
-    with pytest.raises(DataError, match="2 image series"):
-        open_stack(ome(path, more=more))
+    refused(ome(path, more=more), "2 image series")
 
 
 INSTRUMENT = (
@@ -317,7 +314,7 @@ def test_imagej(path: Path, unit: str) -> None:
     ],
 )
 def test_imagej_timing(path: Path, lines: str, rate: float | None) -> None:
-    found = metadata(described(path, f"ImageJ=1.53t\nimages=5\n{lines}\n"))
+    found = imagej(path, lines)
     assert found.frame_rate_hz == (rate if rate is None else pytest.approx(rate))
 
 
@@ -332,7 +329,7 @@ def test_imagej_timing(path: Path, lines: str, rate: float | None) -> None:
 def test_the_speed_of_display_is_never_the_frame_rate(
     path: Path, lines: str, settings: dict[str, str], said: bool
 ) -> None:
-    read = metadata(described(path, f"ImageJ=1.53t\nimages=5\n{lines}\n"))
+    read = imagej(path, lines)
     config = configure({"camera.pixel_size_nm": 84.4, **settings})
     used, notes = resolve_metadata(config, read)
     assert used.camera.frame_rate_hz == read.frame_rate_hz
@@ -368,7 +365,7 @@ def test_imagej_as_tifffile_writes_it(path: Path) -> None:
     ],
 )
 def test_imagej_counts(path: Path, lines: str, gain: float | None, offset: float | None) -> None:
-    found = metadata(described(path, f"ImageJ=1.53t\nimages=5\n{lines}\n"))
+    found = imagej(path, lines)
     assert found.gain_e_per_adu == gain
     assert found.offset_adu == (None if offset is None else pytest.approx(offset))
 
@@ -381,7 +378,7 @@ def test_the_zero_of_signed_numbers_makes_the_gain_right(path: Path) -> None:
     learned = []
     for line in ("cf=0\nc0=-32768.0\nc1=1.0\nvunit=Gray Value\n", ""):
         tags: dict = {270: (ASCII, text.format(line))}
-        write_tiff(path, pages_of(counts), counts.shape[1:], page_tags={0: tags})
+        write_pages(path, counts, page_tags={0: tags})
         with open_stack(path) as stack:
             found = learn_camera(stack, CameraConfig(), (0, 40), metadata=stack.metadata)
         learned.append(found.numbers)
@@ -470,10 +467,8 @@ def test_ome_comes_before_micro_manager(path: Path) -> None:
 
 
 def test_damaged_micro_manager_metadata_is_ignored(path: Path) -> None:
-    data = movie(FRAMES)
-    tags = {51123: (ASCII, "{broken")}
-    write_tiff(path, pages_of(data), data.shape[1:], tags=tags)
-    assert metadata(path) == StackMetadata()
+    broken = write_pages(path, movie(FRAMES), tags={51123: (ASCII, "{broken")})
+    assert metadata(broken) == StackMetadata()
 
 
 # --- plain TIFF --------------------------------------------------------------------------------
@@ -528,17 +523,11 @@ def test_times_tell_which_frames_are_missing(share: float, late_ms: float, seed:
     assert np.mean(wrong) < 0.05
 
 
-@pytest.mark.parametrize("late_ms", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("late_ms", [0.0, 0.3, 1.0, 20.0])
 def test_late_frames_are_not_missing(late_ms: float) -> None:
+    """Times without order tell a mean rate alone."""
     rate, ticks = measure_clock(clock(np.arange(3000), late_ms, seed=2))
-    assert rate == pytest.approx(1e3 / INTERVAL_MS, rel=1e-4)
-    assert ticks is None
-
-
-def test_times_without_order_tell_a_mean_rate_alone() -> None:
-    kept = np.arange(1000)
-    rate, ticks = measure_clock(clock(kept, 20.0, seed=3))
-    assert rate == pytest.approx(1e3 / INTERVAL_MS, rel=0.02)
+    assert rate == pytest.approx(1e3 / INTERVAL_MS, rel=1e-4 if late_ms < 2 else 0.02)
     assert ticks is None
 
 
@@ -557,15 +546,10 @@ def test_times_that_run_backwards_tell_a_mean_rate_alone() -> None:
 
 def test_missing_frames_of_ome_and_micro_manager(path: Path) -> None:
     times = [0, 5, 10, 25, 30]
-    body = "".join(
-        f'<Plane TheT="{t}" TheZ="0" TheC="0" DeltaT="{time}" DeltaTUnit="ms"/>'
-        for t, time in enumerate(times)
-    )
-    found = metadata(ome(path, 'TimeIncrement="6" TimeIncrementUnit="ms"', body))
-    assert found.ticks == (0, 1, 2, 5, 6)
-    assert found.frame_rate_hz == pytest.approx(200)
+    pixels = 'TimeIncrement="6" TimeIncrementUnit="ms"'
     stamps = [{"ElapsedTime-ms": time, "Interval_ms": 6} for time in times]
-    path.unlink()
-    found = metadata(write_micro_manager(path, movie(FRAMES), stamps))
-    assert found.ticks == (0, 1, 2, 5, 6)
-    assert found.frame_rate_hz == pytest.approx(200)
+    found = [metadata(ome(path, pixels, planes(dict(enumerate(times)))))]
+    found.append(metadata(write_micro_manager(path, movie(FRAMES), stamps)))
+    for one in found:
+        assert one.ticks == (0, 1, 2, 5, 6)
+        assert one.frame_rate_hz == pytest.approx(200)

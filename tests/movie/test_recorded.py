@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_files import assert_whole, refused
 
 from iscat_analysis.day.table import read_table
-from iscat_analysis.errors import DataError
 from iscat_analysis.movie import files_of, open_stack
 
 COUNTS = np.random.default_rng(1).integers(0, 60000, (7, 6, 5)).astype("<u2")
@@ -34,19 +34,6 @@ def _settings(path: Path, **changes: object) -> None:
     path.write_text(SETTINGS.format(**given), encoding="utf-8")
 
 
-def _refused(path: Path, *said: str) -> None:
-    with pytest.raises(DataError) as told:
-        open_stack(path)
-    for part in said:
-        assert part in str(told.value)
-    assert "\n" not in str(told.value)
-
-
-def _read(path: Path) -> np.ndarray:
-    with open_stack(path) as stack:
-        return stack.read(0, stack.shape[0])
-
-
 @pytest.mark.parametrize("suffix", [".bin", ".raw"])
 @pytest.mark.parametrize("dtype", ["<u2", "|u1", "<f8"])
 def test_reads_a_movie_with_its_settings(tmp_path: Path, dtype: str, suffix: str) -> None:
@@ -54,7 +41,7 @@ def test_reads_a_movie_with_its_settings(tmp_path: Path, dtype: str, suffix: str
     path = tmp_path / f"movie{suffix}"
     path.write_bytes(counts.tobytes())
     _settings(tmp_path / "movie_settings.dat", dtype=dtype)
-    assert np.array_equal(_read(path), counts)
+    assert_whole(path, counts)
     with open_stack(path) as stack:
         assert stack.shape == COUNTS.shape
         assert stack.read(2, 4).tolist() == counts[2:4].tolist()
@@ -68,7 +55,7 @@ def test_reads_a_movie_with_its_settings(tmp_path: Path, dtype: str, suffix: str
 def test_settings_in_a_folder_of_the_recording(tmp_path: Path) -> None:
     (tmp_path / "frames.bin").write_bytes(COUNTS.tobytes())
     _settings(tmp_path / "settings.dat")
-    assert np.array_equal(_read(tmp_path / "frames.bin"), COUNTS)
+    assert_whole(tmp_path / "frames.bin", COUNTS)
 
 
 def test_what_is_said_on_the_command_line_wins(tmp_path: Path) -> None:
@@ -90,17 +77,17 @@ def test_reads_a_movie_in_parts_from_any_of_them(tmp_path: Path, stem: str) -> N
     hashes = set()
     for number in range(3):
         path = tmp_path / f"{stem}_{number:04}.bin"
-        assert np.array_equal(_read(path), COUNTS)
+        assert_whole(path, COUNTS)
         with open_stack(path) as stack:
             hashes.add(stack.sha256())
         assert len(files_of(path)) == 4
     assert len(hashes) == 1
     assert [row.given for row in read_table(tmp_path).rows] == [f"{stem}_0000.bin"]
     (tmp_path / f"{stem}_0001.bin").rename(tmp_path / "away.bin")
-    _refused(tmp_path / f"{stem}_0000.bin", "part 0001 of its movie is missing")
+    refused(tmp_path / f"{stem}_0000.bin", "part 0001 of its movie is missing")
     (tmp_path / "away.bin").rename(tmp_path / f"{stem}_0001.bin")
     (tmp_path / f"{stem}_0002.bin").unlink()
-    _refused(tmp_path / f"{stem}_0000.bin", "7 frames were saved, but there are 6")
+    refused(tmp_path / f"{stem}_0000.bin", "7 frames were saved, but there are 6")
 
 
 @pytest.mark.parametrize(
@@ -117,42 +104,42 @@ def test_reads_a_movie_in_parts_from_any_of_them(tmp_path: Path, stem: str) -> N
         ({"dtype": ""}, "written when a recording ends"),
     ],
 )
-def test_settings_that_do_not_fit_are_refused(
+def test_settings_that_do_not_fit_arerefused(
     tmp_path: Path, changes: dict[str, object], said: str
 ) -> None:
     (tmp_path / "movie.bin").write_bytes(COUNTS.tobytes())
     _settings(tmp_path / "movie_settings.dat", **changes)
-    _refused(tmp_path / "movie.bin", said, "movie")
+    refused(tmp_path / "movie.bin", said, "movie")
 
 
 def test_frames_added_to_an_earlier_recording_are_read_with_it(tmp_path: Path) -> None:
     (tmp_path / "movie.bin").write_bytes(COUNTS.tobytes())
     _settings(tmp_path / "movie_settings.dat", saved=3, append=True)
-    assert np.array_equal(_read(tmp_path / "movie.bin"), COUNTS)
+    assert_whole(tmp_path / "movie.bin", COUNTS)
 
 
 def test_a_single_frame_is_no_movie(tmp_path: Path) -> None:
     (tmp_path / "movie.bin").write_bytes(COUNTS[:1].tobytes())
     _settings(tmp_path / "movie_settings.dat", saved=1)
-    _refused(tmp_path / "movie.bin", "holds a single frame")
+    refused(tmp_path / "movie.bin", "holds a single frame")
 
 
-def test_settings_that_cannot_be_settings_are_refused(tmp_path: Path) -> None:
+def test_settings_that_cannot_be_settings_arerefused(tmp_path: Path) -> None:
     (tmp_path / "movie.bin").write_bytes(COUNTS.tobytes())
     (tmp_path / "movie_settings.dat").write_bytes(b"\xff\x00" * 100)
-    _refused(tmp_path / "movie.bin", "does not say save/frame/shape")
+    refused(tmp_path / "movie.bin", "does not say save/frame/shape")
     with (tmp_path / "movie_settings.dat").open("wb") as file:
         file.truncate(2**30)
-    _refused(tmp_path / "movie.bin", "has 10000000 at most")
+    refused(tmp_path / "movie.bin", "has 10000000 at most")
 
 
 def test_the_name_of_piscats_movies_tells_their_shape(tmp_path: Path) -> None:
     path = tmp_path / "control_7_6_5_uint16_2.33FPS.raw"
     path.write_bytes(COUNTS.tobytes())
-    assert np.array_equal(_read(path), COUNTS)
+    assert_whole(path, COUNTS)
     assert [row.given for row in read_table(tmp_path).rows] == [path.name]
     path.write_bytes(COUNTS[:-1].tobytes())  # then the name tells nothing
-    _refused(path, "if it is plain numbers, say so")
+    refused(path, "if it is plain numbers, say so")
 
 
 def test_a_folder_leaves_out_numbers_that_nothing_describes(tmp_path: Path) -> None:

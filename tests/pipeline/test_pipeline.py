@@ -66,6 +66,17 @@ def _run(config: Config, folder: Path, **options: Any) -> tuple[Analysis, pd.Dat
     return fit_stack(movie, config, **options), truth
 
 
+def _run_with(folder: Path, pixels: dict[tuple[Any, int, int], int]) -> tuple[Analysis, Any]:
+    """Analyse a movie some of whose counts are replaced."""
+    movie = folder / "movie.tif"
+    truth = write_stack(_small(), movie)
+    counts = tifffile.imread(movie)
+    for place, count in pixels.items():
+        counts[place] = count
+    tifffile.imwrite(movie, counts, photometric="minisblack")
+    return fit_stack(movie, _small()), truth
+
+
 def _match(table: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
     """Estimates in the order of the truth; every particle once, and nothing else."""
     apart = np.hypot(
@@ -202,28 +213,37 @@ GOLD_EVENTS = [
 ]
 
 
-def test_cobri(tmp_path: Path) -> None:
-    config = _small(
-        calibrated={},
-        optics={"scheme": "cobri", "attenuation": 0.06, "na": 1.3, "focus_nm": 0.0},
-        particle=GOLD,
-        simulation={"events": GOLD_EVENTS, "photons_per_pixel": 1e4},
-    )
-    analysis, truth = _run(config, tmp_path)
-    _assert_true(analysis.table, truth, "mass")
+GOLD_IN_ISCAT = {
+    "calibrated": {},
+    "particle": GOLD | {"height_nm": 60.0},
+    # of seed 1 the contrast fluctuates with a probability of 0.11, which is in the error
+    "simulation": {"events": [GOLD_EVENTS[0]], "photons_per_pixel": 1e4, "seed": 2},
+}
+WAYS = {
+    "cobri": {
+        "calibrated": {},
+        "optics": {"scheme": "cobri", "attenuation": 0.06, "na": 1.3, "focus_nm": 0.0},
+        "particle": GOLD,
+        "simulation": {"events": GOLD_EVENTS, "photons_per_pixel": 1e4},
+    },
+    "gold, mass": GOLD_IN_ISCAT | {"fit": {"mode": "mass", "z_range_nm": [0.0, 150.0]}},
+    "gold, localize": GOLD_IN_ISCAT | {"fit": {"mode": "localize", "z_range_nm": [0.0, 150.0]}},
+    "median": {"background": {"method": "median"}},
+    "known": {
+        "background": {"method": "known", "level_e": 4e4}, "simulation": {"background": "flat"},
+    },
+    "same power": {
+        "background": {"power_normalization": False},
+        "simulation": {"background": "flat", "power_noise": 0.0},
+    },
+    "poisson": {"fit": {"likelihood": "poisson"}},
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("mode", ["mass", "localize"])
-def test_gold_in_iscat_without_a_calibration(mode: str, tmp_path: Path) -> None:
-    config = _small(
-        calibrated={},
-        particle=GOLD | {"height_nm": 60.0},
-        fit={"mode": mode, "z_range_nm": [0.0, 150.0]},
-        # of seed 1 the contrast fluctuates with a probability of 0.11, which is in the error
-        simulation={"events": [GOLD_EVENTS[0]], "photons_per_pixel": 1e4, "seed": 2},
-    )
-    analysis, truth = _run(config, tmp_path)
-    _assert_true(analysis.table, truth, mode)
+@pytest.mark.parametrize("sections", WAYS.values(), ids=WAYS.keys())
+def test_every_scheme_and_background_gives_the_truth(sections: dict, tmp_path: Path) -> None:
+    analysis, truth = _run(_small(**sections), tmp_path)
+    _assert_true(analysis.table, truth, analysis.mode)
 
 
 DARK_FIELD = {
@@ -258,45 +278,27 @@ def test_dark_field(level_e: float | None, camera: dict, tmp_path: Path) -> None
     assert analysis.table["contrast"].isna().all()
 
 
-def test_dark_field_refuses_what_needs_a_reference(tmp_path: Path) -> None:
-    config = _small(**DARK_FIELD, background={"level_e": 20.0}, fit={"likelihood": "conditional"})
+@pytest.mark.parametrize(
+    ("fit", "particle", "said"),
+    [
+        ({"likelihood": "conditional"}, {}, "conditional"),
+        ({}, {"photons_per_frame": None}, r"particle\.photons_per_frame is needed in dark field"),
+    ],
+)
+def test_dark_field_refuses_what_needs_a_reference(
+    fit: dict, particle: dict, said: str, tmp_path: Path
+) -> None:
+    """It takes no scale from the simulation either."""
+    config = _small(**DARK_FIELD, background={"level_e": 20.0}, fit=fit)
     movie = tmp_path / "movie.tif"
     write_stack(config, movie)
-    with pytest.raises(ConfigError, match="conditional"):
-        fit_stack(movie, config)
-    assert not movie.with_suffix(".iscat").exists()
-
-
-def test_dark_field_takes_no_scale_from_the_simulation(tmp_path: Path) -> None:
-    config = _small(**DARK_FIELD, background={"level_e": 20.0})
-    particle = config.particle.model_copy(update={"photons_per_frame": None})
-    movie = tmp_path / "movie.tif"
-    write_stack(config, movie)
-    with pytest.raises(ConfigError, match=r"particle\.photons_per_frame is needed in dark field"):
-        fit_stack(movie, config.model_copy(update={"particle": particle}))
+    changed = config.particle.model_copy(update=particle)
+    with pytest.raises(ConfigError, match=said):
+        fit_stack(movie, config.model_copy(update={"particle": changed}))
     assert not movie.with_suffix(".iscat").exists()
 
 
 # ---- other backgrounds, cameras and metadata -----------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "background",
-    [{"method": "median"}, {"method": "known", "level_e": 4e4}, {"power_normalization": False}],
-)
-def test_backgrounds(background: dict[str, Any], tmp_path: Path) -> None:
-    flat = {} if background.get("method") == "median" else {"background": "flat"}
-    if "power_normalization" in background:
-        flat["power_noise"] = 0.0
-    config = _small(background=background, simulation=flat)
-    analysis, truth = _run(config, tmp_path)
-    _assert_true(analysis.table, truth, "mass")
-
-
-def test_poisson_likelihood_on_request(tmp_path: Path) -> None:
-    config = _small(fit={"likelihood": "poisson"})
-    analysis, truth = _run(config, tmp_path)
-    _assert_true(analysis.table, truth, "mass")
 
 
 @pytest.mark.parametrize("told", [True, False])
@@ -330,14 +332,8 @@ def test_maps_of_gain_and_offset(tmp_path: Path) -> None:
 
 
 def test_a_dead_pixel_beside_a_particle_does_no_harm(tmp_path: Path) -> None:
-    config = _small()
-    movie = tmp_path / "movie.tif"
-    truth = write_stack(config, movie)
-    counts = tifffile.imread(movie)
-    counts[:, 21, 20] = 0
-    counts[:, 48, 49] = 0
-    tifffile.imwrite(movie, counts, photometric="minisblack")
-    analysis = fit_stack(movie, config)
+    always = slice(None)
+    analysis, truth = _run_with(tmp_path, {(always, 21, 20): 0, (always, 48, 49): 0})
     assert analysis.summary["masked_pixels"] == 2
     _assert_true(analysis.table, truth, "mass")
 
@@ -398,13 +394,7 @@ def test_neighbours_are_told_apart_and_flagged(tmp_path: Path) -> None:
 
 
 def test_saturation_beside_a_particle_is_flagged(tmp_path: Path) -> None:
-    config = _small()
-    movie = tmp_path / "movie.tif"
-    truth = write_stack(config, movie)
-    counts = tifffile.imread(movie)
-    counts[40, 22, 21] = 65535
-    tifffile.imwrite(movie, counts, photometric="minisblack")
-    analysis = fit_stack(movie, config)
+    analysis, truth = _run_with(tmp_path, {(40, 22, 21): 65535})
     fits = _match(analysis.table, truth)
     assert fits["status"].tolist() == ["saturated", "ok"]
     assert any("saturated" in text for text in analysis.warnings)

@@ -8,51 +8,22 @@ import numpy as np
 import pandas as pd
 import pytest
 import tifffile
+from looked_at import bound_settings, landing_settings, moving_settings
 
 import iscat_analysis as ia
 from iscat_analysis.camera import camera_from_config, measure_windows
 from iscat_analysis.study import Movie
 
 WINDOW, LANDS, LEAVES = 24, 60, 120
-LANDING = {
-    "simulation.frames": 180,
-    "simulation.shape": [64, 64],
-    "simulation.count": 0,
-    "simulation.leavings": 0,
-    "simulation.species": [480.0],
-    "simulation.events": [
-        {"frame": LANDS, "leave": LEAVES, "x_px": 20.3, "y_px": 40.8, "mass_kda": 700.0}
-    ],
-    "background.window_frames": WINDOW,
-    "optics.calibrate": "never",
-}
-BOUND = {
-    "simulation.frames": 120,
-    "simulation.shape": [64, 64],
-    "simulation.events": [
-        {"frame": 60, "x_px": 20.2, "y_px": 22.8, "mass_kda": 900.0},
-        {"frame": 60, "x_px": 45.9, "y_px": 41.1, "mass_kda": 1500.0},
-    ],
-    "background.frames": (0, 60),
-    "fit.frames": (60, 120),
-    "posterior.enabled": False,
-    "optics.calibrate": "never",
-}
-MOVING = {
-    "optics.calibrate": "never",
-    "camera.pixel_size_nm": 84.0,
-    "camera.gain_e_per_adu": 20.0,
-    "camera.frame_rate_hz": 331.0,
-    "calibration.gradient_per_kda": -3.1e-5,
-    "particle.mass_kda": 400.0,
-    "fit.mode": "track",
-    "fit.roi_nm": 2000.0,
-    "posterior.enabled": False,
-    "simulation.shape": [40, 40],
-    "simulation.frames": 40,
-    "simulation.photons_per_pixel": 4e5,
-    "simulation.movers": [{"d_um2_s": 0.3, "x_px": 12.0, "y_px": 20.0, "drift_um_s": [8.0, 0.0]}],
-}
+LANDING = landing_settings(
+    180, {"frame": LANDS, "leave": LEAVES, "x_px": 20.3, "y_px": 40.8, "mass_kda": 700.0}
+) | {"simulation.species": [480.0]}
+BOUND = bound_settings(
+    120,
+    {"x_px": 20.2, "y_px": 22.8, "mass_kda": 900.0},
+    {"x_px": 45.9, "y_px": 41.1, "mass_kda": 1500.0},
+)
+MOVING = moving_settings(40, 40, d_um2_s=0.3, x_px=12.0, y_px=20.0, drift_um_s=[8.0, 0.0])
 
 
 def _written(folder: Path, config: ia.Config, seed: int = 5) -> tuple[Path, pd.DataFrame]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from looked_at import bound_settings, landing_settings, moving_settings
 from matplotlib.figure import Figure
 
 import iscat_analysis as ia
@@ -21,31 +22,17 @@ IMAGE_ATOL = 1e-4
 """Of a contrast, whose peaks here exceed 0.01 and whose noise is 1e-3: the neighbours of a fit move
 by a part of their errors when the last sweep ends."""
 
-LANDING = {
-    "simulation.frames": 160,
-    "simulation.shape": [64, 64],
-    "simulation.count": 0,
-    "simulation.leavings": 0,
-    "simulation.events": [
-        {"frame": 50, "leave": 110, "x_px": 20.3, "y_px": 40.8, "mass_kda": 700.0},
-        {"frame": 62, "x_px": 34.3, "y_px": 32.8, "mass_kda": 1200.0},
-        {"frame": 140, "x_px": 45.0, "y_px": 15.0, "mass_kda": 900.0},
-    ],
-    "background.window_frames": 24,
-    "optics.calibrate": "never",
-}
-BOUND = {
-    "simulation.frames": 100,
-    "simulation.shape": [64, 64],
-    "simulation.events": [
-        {"frame": 50, "x_px": 20.2, "y_px": 22.8, "mass_kda": 900.0},
-        {"frame": 50, "x_px": 35.9, "y_px": 31.1, "mass_kda": 1500.0},
-    ],
-    "background.frames": (0, 50),
-    "fit.frames": (50, 100),
-    "posterior.enabled": False,
-    "optics.calibrate": "never",
-}
+LANDING = landing_settings(
+    160,
+    {"frame": 50, "leave": 110, "x_px": 20.3, "y_px": 40.8, "mass_kda": 700.0},
+    {"frame": 62, "x_px": 34.3, "y_px": 32.8, "mass_kda": 1200.0},
+    {"frame": 140, "x_px": 45.0, "y_px": 15.0, "mass_kda": 900.0},
+)
+BOUND = bound_settings(
+    100,
+    {"x_px": 20.2, "y_px": 22.8, "mass_kda": 900.0},
+    {"x_px": 35.9, "y_px": 31.1, "mass_kda": 1500.0},
+)
 
 
 @pytest.fixture(scope="module")
@@ -68,19 +55,15 @@ def test_the_images_are_those_that_the_fit_saw(written, kind: str, rows: int) ->
         assert len(result) == rows
         for row in range(rows):
             seen, expected = result.images(row), analysed.images(row)
-            assert (seen.event, seen.row_px, seen.column_px) == (
-                row, expected.row_px, expected.column_px,
-            )  # fmt: skip
-            for name in ("contrast", "model"):
-                np.testing.assert_allclose(
-                    getattr(seen, name), getattr(expected, name), atol=IMAGE_ATOL
-                )
+            assert (seen.event, seen.row_px) == (row, expected.row_px)
+            assert seen.column_px == expected.column_px
+            np.testing.assert_allclose(seen.contrast, expected.contrast, atol=IMAGE_ATOL)
+            np.testing.assert_allclose(seen.model, expected.model, atol=IMAGE_ATOL)
             np.testing.assert_allclose(seen.residual, expected.residual, atol=0.1)
             assert (seen.trace is None) == (expected.trace is None)
             if seen.trace is not None and expected.trace is not None:
-                assert (seen.trace.first, seen.trace.frame) == (
-                    expected.trace.first, expected.trace.frame,
-                )  # fmt: skip
+                assert seen.trace.first == expected.trace.first
+                assert seen.trace.frame == expected.trace.frame
                 difference = seen.trace.contrast - expected.trace.contrast
                 assert np.nanmax(np.abs(difference)) < 0.2 * seen.trace.sigma
         # the comparison notices another event
@@ -162,10 +145,9 @@ def test_another_movie_is_refused(written) -> None:
 
 
 def test_what_is_no_result_is_refused(written, tmp_path) -> None:
-    with pytest.raises(ia.DataError, match="no result"):
-        ia.open_result(tmp_path)
-    with pytest.raises(ia.DataError, match="no result"):
-        ia.open_result(tmp_path / "absent.iscat")
+    for folder in (tmp_path, tmp_path / "absent.iscat"):
+        with pytest.raises(ia.DataError, match="no result"):
+            ia.open_result(folder)
     broken = shutil.copytree(written["bound"][0], tmp_path / "broken.iscat")
     (broken / "summary.json").write_text("{", encoding="utf-8")
     with pytest.raises(ia.DataError, match="cannot be read"):
@@ -191,24 +173,8 @@ def test_rows_that_are_not_there_are_refused(written) -> None:
 
 
 def test_particles_that_move_are_drawn_over_their_background(tmp_path) -> None:
-    settings = {
-        "optics.calibrate": "never",
-        "camera.pixel_size_nm": 84.0,
-        "camera.gain_e_per_adu": 20.0,
-        "camera.frame_rate_hz": 331.0,
-        "calibration.gradient_per_kda": -3.1e-5,
-        "particle.mass_kda": 400.0,
-        "fit.mode": "track",
-        "track.free": "mass",
-        "fit.roi_nm": 2000.0,
-        "posterior.enabled": False,
-        "simulation.shape": [36, 36],
-        "simulation.frames": 30,
-        "simulation.photons_per_pixel": 4e5,
-        "simulation.movers": [
-            {"d_um2_s": 0.2, "x_px": 8.0, "y_px": 17.0, "drift_um_s": [12.0, 0.0]}
-        ],
-    }
+    settings = moving_settings(36, 30, d_um2_s=0.2, x_px=8.0, y_px=17.0, drift_um_s=[12.0, 0.0])
+    settings["track.free"] = "mass"
     config = ia.configure(None, settings=settings)
     ia.simulate_movie(config, tmp_path / "movie.tif", seed=2)
     analysed = ia.fit_movie(tmp_path / "movie.tif", config=config, out=tmp_path / "movie.iscat")
