@@ -96,7 +96,7 @@ def init(
         answers=answers.by_key,
         ask=None if yes or not sys.stdin.isatty() else _ask,
         instrument=instrument,
-        warn=messages.note,
+        note=messages.note,
         out=output.out,
         overwrite=output.overwrite,
     )

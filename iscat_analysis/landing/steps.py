@@ -12,14 +12,14 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import compress
 
 import numpy as np
 
 from iscat_analysis._kernels.sliding import strongest_maps
 from iscat_analysis.fitting.context import reported_steps
-from iscat_analysis.fitting.events import Event, fit_flags, standing_out, with_index, with_spheres
+from iscat_analysis.fitting.events import fit_flags, standing_out, with_index, with_spheres
 from iscat_analysis.inference.fit import (
     POOR_FIT_P,
     detection_snr,
@@ -57,15 +57,6 @@ _SWEEPS = 10  # fits of what has neighbours that still move, with everything els
 _LEAST_THRESHOLD_SHARE = 0.7
 _SAME_PX = 1.5
 _LEAST_MASS_RATIO = 5.0  # times the mass of a step that another has, of whose light it may be
-
-
-@dataclass(frozen=True)
-class _Finished:
-    """A step after its last fit, before it is judged."""
-
-    fitted: StepEvent
-    crowded: bool  # as of its `Task`
-    lobe: bool  # found where the fit of a known step may have left a residual
 
 
 class ChunkFitter:
@@ -248,7 +239,7 @@ class ChunkFitter:
                 return self.neighbours.draw_sphere(
                     step.sign, task.at, model_of(likelihood), fit, excess
                 )
-            likelihood, start = task.likelihood, _displaced(self._seated(step), *task.offset_px)
+            likelihood, start = task.likelihood, task.displaced(self._seated(step))
             box = search_box(likelihood, start, self._quick_mode, z_range, level=True)
             theta = start_theta(likelihood, start) if step.theta is None else step.theta.copy()
             if not box.free[2]:
@@ -268,10 +259,10 @@ class ChunkFitter:
         z_range = self._context.config.fit.z_range_nm
 
         def fitted(step: Step, task: Task) -> Step:
-            start = _displaced(step.start, *task.offset_px)
             fit = fit_particle(
-                task.likelihood, start, self._context.mode, z_range, level=True, correct_bias=False
-            )
+                task.likelihood, task.displaced(step.start), self._context.mode, z_range,
+                level=True, correct_bias=False,
+            )  # fmt: skip
             return self._moved(step, task, fit.theta, fit.snr) if fit.mass_kda > 0 else step
 
         return self._refitted(steps, chosen, near, fitted)
@@ -329,7 +320,7 @@ class ChunkFitter:
         around: Sequence[Sequence[int]],
         *,
         lobe: bool,
-    ) -> _Finished | None:
+    ) -> StepEvent | None:
         """Fit a step for good."""
         context, step = self._context, steps[index]
         task = self._tasks.build(index, steps, near)
@@ -338,22 +329,15 @@ class ChunkFitter:
         likelihood = task.likelihood
         if likelihood.n_pixels < 0.5 * math.prod(likelihood.grid.shape):
             return None
-        y_px, x_px = task.offset_px
-        start = _displaced(self._seated(step), y_px, x_px)
         if step.sphere is None:
-            fit = fit_particle(
-                likelihood, start, context.mode, context.config.fit.z_range_nm, level=True
-            )
+            start, z_range = task.displaced(self._seated(step)), context.config.fit.z_range_nm
+            fit = fit_particle(likelihood, start, context.mode, z_range, level=True)
         else:
             likelihood, fit = refitted(likelihood, *step.sphere, level=True)
         if fit.mass_kda <= 0 and "mass_kda" in fit.free:
             return None
-        pixel = context.pixel_nm
-        event = Event(
-            task.region, fit.shifted(-x_px * pixel, -y_px * pixel), likelihood, task.windows, (),
-            task.at.frame, task.n_before, task.n_after, step.sign, task.at.half_width,
-            task.at.rise,
-        )  # fmt: skip
+        y_nm, x_nm = context.pixel_nm * task.offset_px
+        event = task.event(fit.shifted(-x_nm, -y_nm), likelihood, step.sign)
         if event.snr < _LEAST_THRESHOLD_SHARE * context.templates.threshold:
             return None
         event, told = with_index(context, event)
@@ -363,27 +347,23 @@ class ChunkFitter:
         far = others if context.lines is not None else [steps[i] for i in around[index]]
         spans, lighting = self._tasks.trace_spans(step, task.windows, far)
         repeats = step_repeats(spans, event, step, lighting, self.neighbours)
-        return _Finished(StepEvent(event, step, others, repeats, told), task.crowded, lobe)
+        return StepEvent(event, step, others, repeats, told, task.crowded, lobe)
 
-    def _judged(self, finished: Sequence[_Finished], beside: Sequence[Step]) -> list[StepEvent]:
+    def _judged(self, finished: Sequence[StepEvent], beside: Sequence[Step]) -> list[StepEvent]:
         """Judge all steps, including side lobes and steps that explain less than they leave.
 
         Steps `beside` them are not reported, but their residuals may be found as steps.
         """
         if self._tries_spheres:
-            events = with_spheres(
-                self._context, [own.fitted.event for own in finished], self._pool, level=True
-            )
-            finished = [
-                replace(own, fitted=replace(own.fitted, event=event))
-                for own, event in zip(finished, events, strict=True)
-            ]
-        steps = [*(own.fitted.step for own in finished), *beside]
+            fitted = [own.event for own in finished]
+            events = with_spheres(self._context, fitted, self._pool, level=True)
+            finished = [replace(o, event=e) for o, e in zip(finished, events, strict=True)]
+        steps = [*(own.step for own in finished), *beside]
         settling = {
             sign: go_on_rising([step.at.settling for step in steps if step.sign == sign])
             for sign in (1, -1)
         }
-        described = [own.fitted.event.described for own in finished]
+        described = [own.event.described for own in finished]
         described += [
             Described(s.start.snr if s.theta is None else s.snr, s.excess) for s in beside
         ]
@@ -396,11 +376,10 @@ class ChunkFitter:
             near = np.flatnonzero(
                 at_once & (away < LARGEST_IMAGE * self.neighbours.roi_px)
             ).tolist()
-            event = own.fitted.event
             flags = fit_flags(
                 self._context,
-                event,
-                event.windows,
+                own.event,
+                own.event.windows,
                 sidelobe=own.lobe or described[number].is_dwarfed(described[i] for i in near),
                 too_close=own.crowded,
                 changing=steps[number].at.p_constant < POOR_FIT_P
@@ -410,7 +389,7 @@ class ChunkFitter:
                     for i in near
                 ),
             )
-            judged.append(replace(own.fitted, event=replace(event, flags=flags)))
+            judged.append(replace(own, event=replace(own.event, flags=flags)))
         return judged
 
     def _credible(self, steps: Sequence[Step]) -> list[Step]:
@@ -456,10 +435,3 @@ def _places(steps: Sequence[Step]) -> tuple[FloatArray, FloatArray]:
     """Give x and y of all [pixels]."""
     x_px, y_px = (np.array([getattr(s.start, axis) for s in steps]) for axis in ("x_px", "y_px"))
     return x_px, y_px
-
-
-def _displaced(start: Candidate, y_px: float, x_px: float) -> Candidate:
-    """Move a candidate."""
-    if y_px == x_px == 0:  # where nothing drifts
-        return start
-    return replace(start, x_px=start.x_px + x_px, y_px=start.y_px + y_px)

@@ -20,7 +20,7 @@ from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.records import BoolArray, Clip, FloatArray, Trace, Windows
+from iscat_analysis.records import BoolArray, Candidate, Clip, FitResult, FloatArray, Trace, Windows
 from iscat_analysis.search.dating import StepFrame, crosstalk, frame_heights, locate_step
 from iscat_analysis.search.frames import Patch
 from iscat_analysis.trust.changing_light import SAME_NM
@@ -48,6 +48,19 @@ class Task:
     crowded: bool
     offset_px: FloatArray
 
+    def displaced(self, start: Candidate) -> Candidate:
+        """Move a candidate to where it is in the frames with its particle."""
+        y_px, x_px = self.offset_px
+        return replace(start, x_px=start.x_px + x_px, y_px=start.y_px + y_px)
+
+    def event(self, fit: FitResult, likelihood: Likelihood, sign: int) -> Event:
+        """Make an event of a fit."""
+        at, counts = self.at, (self.n_before, self.n_after)
+        return Event(
+            self.region, fit, likelihood, self.windows, (), at.frame, *counts, sign,
+            at.half_width, at.rise,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True)
 class StepEvent:
@@ -58,6 +71,8 @@ class StepEvent:
     others: tuple[Step, ...]
     repeats: FloatArray
     told: Told | None = None  # of a sphere whose picture does not tell its index
+    crowded: bool = False  # as of its `Task`
+    lobe: bool = False  # found where the fit of a known step may have left a residual
 
 
 class TaskBuilder:

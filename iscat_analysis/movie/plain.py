@@ -24,7 +24,6 @@ import math
 import re
 import tokenize
 import warnings
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -43,31 +42,24 @@ from iscat_analysis.movie.mapped import (
     release,
     unmap,
 )
-from iscat_analysis.movie.stack import FileSet, single_frame
+from iscat_analysis.movie.stack import FileSet, shape_of_frames, single_frame
 from iscat_analysis.reading import is_file, open_regular, read_text
 from iscat_analysis.records import InPlace, StackMetadata
 
-_LEAST_BYTE_GAIN = 8.0  # of the smoothness, if bytes are swapped; 3 for the noisiest real movies
-_LEAST_AXES_GAIN = 2.0  # of the smoothness across rows, if columns are stored one after the other
 _LEAST_PIXELS = 1024  # of a frame that tell an order
-_LOOKED_AT = 4  # pairs of frames
-
-
-def looked_at(frames: int) -> Iterator[tuple[int, int]]:
-    """Choose pairs of successive frames, all over a movie."""
-    for start in dict.fromkeys(np.linspace(0, frames - 2, _LOOKED_AT, dtype=int).tolist()):
-        yield start, start + 2
 
 
 def bytes_are_swapped(counts: NDArray[Any]) -> bool:
     """Tell whether numbers are far smoother in time with their bytes the other way round.
+
+    The noisiest real movies are three times as smooth.
 
     Shapes: `counts` (t, y, x), in pairs of successive frames.
     """
     if counts.dtype.itemsize < 2 or counts.size < _LEAST_PIXELS:
         return False
     given, swapped = (_change(numbers) for numbers in (counts, counts.byteswap()))
-    return given > _LEAST_BYTE_GAIN * swapped
+    return given > 8 * swapped
 
 
 def _change(counts: NDArray[Any]) -> float:
@@ -97,7 +89,7 @@ def lines_are_exchanged(counts: NDArray[Any]) -> bool:
     given, other = (
         float(np.mean(np.diff(lines, axis=0) ** 2)) for lines in (mean, mean.reshape(mean.T.shape))
     )
-    return given > _LEAST_AXES_GAIN * other
+    return given > 2 * other
 
 
 NPY_SIGNATURE = b"\x93NUMPY"
@@ -124,11 +116,7 @@ class MappedFrames:
         axes: Axes = ROWS_TOGETHER,
         notes: tuple[str, ...] = (),
     ) -> None:
-        if len(shape) != 3 or min(shape) < 1 or stored.kind not in "uif":
-            raise DataError(
-                f"{path}: needs to be frames (t, y, x) of integers or floats but is {stored} of "
-                f"shape {shape}; save the camera's counts, one frame after the other"
-            )
+        self.shape = shape_of_frames(shape, stored, path)
         self._path, self._data = path, map_file(path)
         needed = offset + math.prod(shape) * stored.itemsize
         if needed > len(self._data):
@@ -138,7 +126,6 @@ class MappedFrames:
                 f"{path}: is truncated ({shape[0]} frames of {shape[1]} x {shape[2]} {stored} need "
                 f"{needed} bytes, it has {held}); copy it again or export it again"
             )
-        self.shape = (shape[0], shape[1], shape[2])
         self.dtype: np.dtype[Any] = stored.newbyteorder("=")
         self._stored, self._offset, self._axes = stored, offset, axes
         self.notes = notes
@@ -214,13 +201,11 @@ def open_raw(path: Path, part: str) -> MappedFrames:
             f"type, as in {example}; behind a header, and column by column: {example},header=344,"
             "order=columns"
         )
-    try:
-        stored = np.dtype(found.type_name)
-    except (TypeError, ValueError, SyntaxError):
-        raise DataError(
-            f"{path}{MARK}{part}: {found.type_name} is no type of numbers; write uint8, uint16, "
-            f"float32 or, for the larger byte first, >u2, as in {example}"
-        ) from None
+    stored = _type_named(
+        found.type_name,
+        f"{path}{MARK}{part}: {found.type_name} is no type of numbers; write uint8, uint16, "
+        f"float32 or, for the larger byte first, >u2, as in {example}",
+    )
     size, frame = path.stat().st_size, found.rows * found.columns * stored.itemsize
     held = size - found.header_bytes
     number = found.frames or (max(held, 0) // frame if frame else 0)
@@ -236,17 +221,24 @@ def open_raw(path: Path, part: str) -> MappedFrames:
                 f'"{path}{MARK}{header}"'
             )
         raise DataError(f"{path}: has {size} bytes, but {part} needs {needs}{behind}; {remedy}")
-    shape, axes = (number, found.rows, found.columns), ROWS_TOGETHER
-    if found.by_columns:
-        axes = COLUMNS_TOGETHER
+    shape = number, found.rows, found.columns
+    axes = COLUMNS_TOGETHER if found.by_columns else ROWS_TOGETHER
     frames = MappedFrames(path, shape, stored, offset=found.header_bytes, axes=axes)
     refuse_disorder(frames, found._replace(frames=number), path)
     return frames
 
 
+def _type_named(name: str, refusal: str) -> np.dtype[Any]:
+    try:
+        return np.dtype(name)
+    except (TypeError, ValueError, SyntaxError):
+        raise DataError(refusal) from None
+
+
 def refuse_disorder(frames: MappedFrames, said: Layout, path: Path) -> None:
     """Refuse numbers that are far smoother in another order than was said, and close them."""
-    counts = np.concatenate([frames.read(*pair) for pair in looked_at(frames.shape[0])])
+    starts = np.unique(np.linspace(0, frames.shape[0] - 2, 4, dtype=int)).tolist()
+    counts = np.concatenate([frames.read(start, start + 2) for start in starts])
     cause = ""
     if bytes_are_swapped(counts):
         stored = np.dtype(said.type_name).newbyteorder("S")
@@ -283,11 +275,9 @@ def description_of(path: Path) -> Path | None:
     """Find what describes a file of plain numbers."""
     if path.suffix.lower() not in SUFFIXES:
         return None
-    for stem in dict.fromkeys((path.stem, _PART.sub("", path.stem))):
-        for settings in _settings(stem, path):
-            if is_file(settings):
-                return settings
-    return path if _named(path) is not None else None
+    stems = dict.fromkeys((path.stem, _PART.sub("", path.stem)))
+    found = (each for stem in stems for each in _settings(stem, path) if is_file(each))
+    return next(found, path if _named(path) is not None else None)
 
 
 def recorded_files(path: Path) -> tuple[Path, ...]:
@@ -348,10 +338,7 @@ def _counted(
             "when a recording ends; wait until it does, or give the shape yourself, as in "
             f'"{files[0].name}{MARK}1500x128x128,uint16"'
         )
-    try:
-        stored = np.dtype(name)
-    except (TypeError, ValueError, SyntaxError):
-        raise DataError(f"{settings}: save/frame/dtype = {name} is no type of numbers") from None
+    stored = _type_named(name, f"{settings}: save/frame/dtype = {name} is no type of numbers")
     rows, columns = int(shape[1]), int(shape[2])
     frame = rows * columns * stored.itemsize
     counts = {}

@@ -118,15 +118,9 @@ class ArrayFrames:
     def __init__(
         self, array: ArrayLike, name: str, metadata: StackMetadata, notes: tuple[str, ...] = ()
     ) -> None:
-        shape = tuple(int(n) for n in array.shape)
-        stored = np.dtype(array.dtype)
-        if len(shape) != 3 or 0 in shape or stored.kind not in "uif":
-            raise DataError(
-                f"{name}: needs to be frames (t, y, x) of integers or floats but is {stored} of "
-                f"shape {shape}; pass the camera's counts, one frame after the other"
-            )
         self._array = array
-        self.shape = (shape[0], shape[1], shape[2])
+        stored = np.dtype(array.dtype)
+        self.shape = shape_of_frames(tuple(int(n) for n in array.shape), stored, name)
         self.dtype = stored.newbyteorder("=")
         self.metadata, self.notes = metadata, notes
         depth = getattr(array, "depth", 1)
@@ -137,6 +131,18 @@ class ArrayFrames:
 
     def close(self) -> None:
         """Leave the array as it is; it belongs to the caller."""
+
+
+def shape_of_frames(
+    shape: tuple[int, ...], stored: np.dtype[Any], name: object
+) -> tuple[int, int, int]:
+    """Give a shape if it is one of frames, and their numbers are counts."""
+    if len(shape) != 3 or min(shape) < 1 or stored.kind not in "uif":
+        raise DataError(
+            f"{name}: needs to be frames (t, y, x) of integers or floats but is {stored} of "
+            f"shape {shape}; save or pass the camera's counts, one frame after the other"
+        )
+    return shape[0], shape[1], shape[2]
 
 
 def single_frame(name: object) -> DataError:

@@ -26,7 +26,7 @@ from iscat_analysis.camera import LARGEST_PX, Camera, CutFrames, LightModel, Mov
 from iscat_analysis.diagnosis import Prepared, survey_over, within
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext, make_context, reported_steps
-from iscat_analysis.fitting.events import Event, Fitted
+from iscat_analysis.fitting.events import Fitted
 from iscat_analysis.fitting.pattern import SPAN, corrected
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.results import DetectionResult, view_of
@@ -384,15 +384,9 @@ class StoredSteps:
         if task is None:
             name = self._ready.steady.name
             raise DataError(f"{name}: there are no frames around frame {frame} to draw")
-        start, (y_px, x_px) = steps[0].start, task.offset_px
-        start = Candidate(
-            start.x_px + x_px, start.y_px + y_px, start.z_nm, start.mass_kda, start.snr
-        )
-        fit = fit_particle(task.likelihood, start, context.mode, config.fit.z_range_nm, level=True)
-        event = Event(
-            task.region, fit, task.likelihood, task.windows, (), task.at.frame, task.n_before,
-            task.n_after, steps[0].sign, task.at.half_width, task.at.rise,
-        )  # fmt: skip
+        start, z_range = task.displaced(steps[0].start), config.fit.z_range_nm
+        fit = fit_particle(task.likelihood, start, context.mode, z_range, level=True)
+        event = task.event(fit, task.likelihood, steps[0].sign)
         step = replace(steps[0], at=task.at)
         fitted = StepEvent(event, step, tuple(steps[1:]), np.zeros(0))
         trace = trace_of(fitted, patch_of(fitted, neighbours), tasks)

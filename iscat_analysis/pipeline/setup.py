@@ -123,7 +123,7 @@ def write_setup(
     answers: Mapping[str, float | str] | None = None,
     ask: Callable[[Question], str] | None = None,
     instrument: str | None = None,
-    warn: Callable[[str], None] = lambda _: None,
+    note: Callable[[str], None] = lambda _: None,
     out: Path | None = None,
     overwrite: bool = False,
 ) -> Setup:
@@ -131,17 +131,17 @@ def write_setup(
 
     `answers` are keys of the configuration and what the user has said already; `ask` puts the
     questions that are left, and without it defaults are taken, or before these what a named
-    `instrument` has; `warn` says what is known, line by line.
+    `instrument` has; `note` is told what is known, line by line.
     """
     target = setup_beside(movie) if out is None else out
     if target.exists() and not overwrite:
         raise DataError(f"{target}: exists already; give another name, or pass `overwrite`")
     with open_stack(movie) as stack:
         frames, rows, columns = stack.shape
-        warn(f"{stack.name}: {frames} frames of {rows} × {columns} pixels, {stack.dtype}")
+        note(f"{stack.name}: {frames} frames of {rows} × {columns} pixels, {stack.dtype}")
         known = _known_values(stack.metadata, answers or {}, instrument)
-        warn(_metadata_line(stack))
-        values, config = _ask_the_rest(known, ask, warn)
+        note(_metadata_line(stack))
+        values, config = _ask_the_rest(known, ask, note)
         if config.camera.pixel_size_nm is None:
             raise DataError(
                 f"{stack.name}: its metadata do not say how large a pixel is, which nobody can "
@@ -204,14 +204,14 @@ def _with_learning(value: Value, config: Config) -> Value:
 
 
 def _ask_the_rest(
-    known: list[Value], ask: Callable[[Question], str] | None, warn: Callable[[str], None]
+    known: list[Value], ask: Callable[[Question], str] | None, note: Callable[[str], None]
 ) -> tuple[list[Value], Config]:
     """Ask for each open key, again where an answer is invalid."""
     config = configure(None, settings={each.key: each.value for each in known})
     values = list(known)
     open_questions = [q for q in _QUESTIONS if q.key not in {each.key for each in known}]
     if open_questions:
-        warn("not known: " + ", ".join(question.words for question in open_questions))
+        note("not known: " + ", ".join(question.words for question in open_questions))
     for question in open_questions:
         answer: float | str | None = question.default
         while ask is not None:
@@ -220,7 +220,7 @@ def _ask_the_rest(
                 config = configure(config, settings={question.key: answer})
                 break
             except ConfigError as error:
-                warn(str(error))
+                note(str(error))
         if answer is None:
             continue
         given = _config_value(config, question.key)

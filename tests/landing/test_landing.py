@@ -694,7 +694,9 @@ def test_where_nothing_drifts_the_correction_changes_nothing(
 
 
 def test_without_a_pattern_there_is_nothing_to_correct() -> None:
-    short = _config(CORRECTED, "simulation.background=flat", "simulation.frames=160")
+    short = _config(
+        CORRECTED, "simulation.background=flat", "simulation.frames=160", events=EVENTS[:1]
+    )
     result, told = _run(drawn(short), short)
     assert not result.summary["drift_corrected"]
     assert result.summary["drift_x_px"] is None
