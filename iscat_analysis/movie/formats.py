@@ -20,6 +20,7 @@ from iscat_analysis.movie.containers import (
     is_matlab_hdf5,
     open_member,
 )
+from iscat_analysis.movie.descriptions import with_side_files
 from iscat_analysis.movie.mapped import HDF5_SIGNATURE, Writer, writer_of
 from iscat_analysis.movie.microscopes import needed_package, open_czi, open_nd2
 from iscat_analysis.movie.plain import (
@@ -31,7 +32,6 @@ from iscat_analysis.movie.plain import (
     recorded_files,
 )
 from iscat_analysis.movie.plain import SUFFIXES as RECORDED
-from iscat_analysis.movie.side_files import with_side_files
 from iscat_analysis.movie.stack import Frames, Stack, single_frame
 from iscat_analysis.movie.tiff import (
     TIFF_SUFFIXES,

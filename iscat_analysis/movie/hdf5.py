@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
 from iscat_analysis.movie.containers import name_one
-from iscat_analysis.movie.descriptions import Hints, merge
+from iscat_analysis.movie.descriptions import Hints, merge, positive
 from iscat_analysis.movie.mapped import (
     HARMLESS_BYTES,
     MOST_FRAME_DECODED_RATIO,
@@ -49,7 +49,6 @@ from iscat_analysis.movie.mapped import (
     refuse_large_chunks,
     writer_of,
 )
-from iscat_analysis.movie.side_files import positive
 from iscat_analysis.movie.stack import Frames, Read, in_slabs
 from iscat_analysis.records import StackMetadata
 from iscat_analysis.units import listed

@@ -21,12 +21,13 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie.descriptions import (
     TIME_FROM_HEIGHTS,
     Hints,
+    inverse,
     measure_clock,
     merge,
+    positive,
     time_axis,
 )
 from iscat_analysis.movie.mapped import damaged, refuse_growth
-from iscat_analysis.movie.side_files import inverse, positive
 from iscat_analysis.records import StackMetadata
 
 _CZI_TYPES = {"Gray8": "u1", "Gray16": "u2", "Gray32": "u4", "Gray32Float": "f4"}

@@ -31,9 +31,8 @@ from zarr.storage import LocalStore
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
-from iscat_analysis.movie.descriptions import LENGTH_NM, TIME_S, Hints, merge
+from iscat_analysis.movie.descriptions import LENGTH_NM, TIME_S, Hints, inverse, merge, positive
 from iscat_analysis.movie.mapped import damaged, refuse_growth, refuse_large_chunks
-from iscat_analysis.movie.side_files import inverse, positive
 from iscat_analysis.movie.stack import ArrayFrames
 from iscat_analysis.reading import LARGEST_TEXT_BYTES
 from iscat_analysis.records import StackMetadata
