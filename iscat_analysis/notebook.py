@@ -25,6 +25,7 @@ from iscat_analysis.bounds.shared import forecast_optics as _forecast
 from iscat_analysis.config import LARGEST_NM, Config, configure
 from iscat_analysis.executors import THREADS, open_executor
 from iscat_analysis.findings import Finding
+from iscat_analysis.fitting.run import Run
 from iscat_analysis.inference.checks import number_in, path_in, truth_in
 from iscat_analysis.instrument.learning import calibrate_movie
 from iscat_analysis.instrument.result import OpticsCalibration
@@ -506,7 +507,8 @@ def fit_movie(
         open_executor(scheduler, scheduler_file) as executor,
     ):
         command = f"iscat_analysis.fit_movie({str(stack.path)!r})"
-        analysis = analyse(stack, resolved, progress=progress, command=command, executor=executor)
+        run = Run(progress=progress, executor=executor)
+        analysis = analyse(stack, resolved, run, command=command)
     result = Result(analysis)
     if folder is not None:
         result.save(folder, overwrite=overwrite)

@@ -90,7 +90,7 @@ class TaskBuilder:
         self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]]
     ) -> Task | None:
         """Set up the likelihood of a step with its neighbours in place; None without frames."""
-        context, chunk, step = self._context, self._chunk, steps[index]
+        context, chunk, moving, step = self._context, self._chunk, self._pattern, steps[index]
         region = region_around(self._roi_px, chunk.shape, step.start)
         neighbours = [steps[i] for i in near[index]]
         limit_px = context.config.detection.min_separation_nm / context.pixel_nm
@@ -100,11 +100,8 @@ class TaskBuilder:
         reach = self._search_reach if step.theta is None else 0
         held = chunk.patch(span[0] - reach, span[1] + reach, region.rows, region.columns)
         patch = held.frames(*span)
-        if len(patch.counts) < 2:
-            return None
-        moving = self._pattern
         local = moving.local(region, step.at.frame) if moving else None
-        at = self._locate(step, neighbours, region, patch, local)
+        at = self._locate(step, neighbours, region, patch, local) if len(patch.counts) > 1 else None
         if at is None:
             return None
         if moving and at.frame != step.at.frame:

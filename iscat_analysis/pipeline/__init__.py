@@ -117,16 +117,8 @@ def fit_stack(
     with claim_output(folder, overwrite):
         with open_stack(stack) as movie:
             movie.hashed()
-            analysis = analyse(
-                movie,
-                config,
-                progress=progress,
-                notify=notify,
-                command=command,
-                partial=partial,
-                inject=inject,
-                executor=executor,
-            )
+            run = Run(notify, progress, partial, executor or Executor(), inject)
+            analysis = analyse(movie, config, run, command=command)
         with parts_kept(partial if kind.keeps_parts else None):
             write_report(analysis, folder, overwrite=overwrite, event_figures=kind.event_figures)
         if not analysis.summary["interrupted"]:
@@ -139,33 +131,23 @@ def fit_stack(
     return analysis
 
 
-def analyse(
-    movie: Stack,
-    config: Config,
-    *,
-    progress: Progress = silent,
-    notify: Notify = notify_nobody,
-    command: str = "",
-    partial: Path | None = None,
-    inject: int = 0,
-    executor: Executor | None = None,
-) -> Analysis:
+def analyse(movie: Stack, config: Config, run: Run | None = None, *, command: str = "") -> Analysis:
     """Analyse an open movie."""
-    if executor is not None and executor.distant and not movie.identity:
+    run = run or Run()
+    if run.executor.distant and not movie.identity:
         raise ConfigError(
             f"{movie.name}: is an array, and workers read a movie from its file: save it, as with "
             "numpy.save, and give its path; or leave `scheduler` out"
         )
     refuse_rod(config, "iscat-fit does not fit directions")
     started = datetime.now(UTC).isoformat(timespec="seconds")
-    with compiling(notify):
-        run = Run(notify, progress, partial, executor or Executor(), inject)
+    with compiling(run.notify):
         kind = kind_of(config)
         ready = prepare(movie, config, run)  # load, calibrate
         if kind.inject is None:
             _refuse_injection(run, movie.name)
         found = kind.find(ready, run)  # background, detect, fit, posterior, bounds
-        with parts_kept(partial if kind.keeps_parts else None):
+        with parts_kept(run.partial if kind.keeps_parts else None):
             extra: dict[str, Any] = {}
             if kind.inject and run.inject and not found.interrupted:
                 try:

@@ -143,7 +143,7 @@ def inject_and_recover(ready: Prepared, run: Run, result: DetectionResult) -> di
     frames = fitted_frames(movie, config)
     window = int(result.summary["window_frames"])
     fixed = config.background.model_copy(update={"window_frames": window})
-    particles = _draw_particles(result, movie.shape[1:], frames, window, run.inject)
+    particles = draw_particles(result, movie.shape[1:], frames, window, run.inject)
     lines = result.context.lines if isinstance(result.context.lines, LightModel) else None
     again = analyse_landings(
         InjectedMovie(movie, camera, particles, config.compute.seed, result.trajectory),
@@ -159,7 +159,7 @@ def inject_and_recover(ready: Prepared, run: Run, result: DetectionResult) -> di
     return _recovery(particles, rows, result.context, frames[1], window, searched)
 
 
-def _draw_particles(
+def draw_particles(
     result: DetectionResult,
     field_px: tuple[int, int],
     frames: tuple[int, int],

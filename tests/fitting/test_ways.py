@@ -19,6 +19,7 @@ from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import Event, fit_flags, standing_out
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.fitting.ranges import BackgroundMode, background_mode, describe_background_mode
+from iscat_analysis.fitting.run import Run
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline import analyse
@@ -241,7 +242,7 @@ def test_what_needs_no_frames_before_the_particles_is_named(
     for one, kind, begins in ((config, ConfigError, "which frames"), (whole, DataError, "array")):
         told: list[str] = []
         with open_stack(counts) as movie, pytest.raises(kind, match=begins) as refused:
-            analyse(movie, one, notify=told.append)
+            analyse(movie, one, Run(told.append))
         assert all(word in str(refused.value) for word in words)
         assert not any("diffusion coefficient" in line for line in told)
 
@@ -251,6 +252,6 @@ def test_a_run_says_its_method_first() -> None:
     config = _config("fixed")
     counts = np.array(list(Movie(config, 1).frames(1)))
     with open_stack(counts) as movie:
-        analyse(movie, config, notify=told.append)
+        analyse(movie, config, Run(told.append))
     said = describe_background_mode(config)
     assert [text for text in told if "background.method" in text] == [said]

@@ -811,7 +811,7 @@ def test_injected_particles_drift_along(followed: Found) -> None:
 def test_injected_particles_are_recovered(movie: Path) -> None:
     config = _config("posterior.enabled=false")
     with open_stack(movie) as stack:
-        summary = analyse(stack, config, inject=6).summary["injection"]
+        summary = analyse(stack, config, Run(inject=6)).summary["injection"]
     assert summary["added"] == 12
     assert summary["recall"] > 0.7
     assert summary["recall_isolated"] in (None, 1.0)
@@ -820,4 +820,4 @@ def test_injected_particles_are_recovered(movie: Path) -> None:
 def test_injection_needs_sliding_windows(movie: Path) -> None:
     config = _config("background.frames=[0, 60]", "posterior.enabled=false")
     with open_stack(movie) as stack, pytest.raises(ConfigError, match="`inject` = "):
-        analyse(stack, config, inject=8)
+        analyse(stack, config, Run(inject=8))

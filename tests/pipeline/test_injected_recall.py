@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 import iscat_analysis as ia
 from iscat_analysis.bounds import power_searched
+from iscat_analysis.fitting.run import Run
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.pipeline import landings as injection
 
@@ -31,16 +33,17 @@ def test_recall_near_the_threshold_is_the_predicted_one(
     ia.simulate_movie(config, tmp_path / "movie.tif", seed=3)
     real, threshold = injection.draw_particles, []
 
-    def faint(context: Any, *arguments: Any) -> Any:
-        *before, table, seed = arguments
+    def faint(result: Any, *arguments: Any) -> Any:
+        table = result.fits
         sigma = float(table["crb_mass_kda"][table["status"] == "ok"].median())
-        threshold.append(context.templates.threshold)
+        threshold.append(result.context.templates.threshold)
         mass = 0.95 * sigma * threshold[0]
-        return real(context, *before, pd.DataFrame({"mass_kda": [mass], "status": ["ok"]}), seed)
+        one = pd.DataFrame({"mass_kda": [mass], "status": ["ok"]})
+        return real(replace(result, fits=one), *arguments)
 
     monkeypatch.setattr(injection, "draw_particles", faint)
     with ia.open_stack(tmp_path / "movie.tif") as movie:
-        found = analyse(movie, config, inject=ADDED).summary["injection"]
+        found = analyse(movie, config, Run(inject=ADDED)).summary["injection"]
     expected = found["predicted"]
     error = math.sqrt(expected * (1 - expected) / found["added"])
     assert 0.3 < expected < 0.7  # on the slope of the curve

@@ -66,12 +66,12 @@ def _run(config: Config, folder: Path, **options: Any) -> tuple[Analysis, pd.Dat
     return fit_stack(movie, config, **options), truth
 
 
-def _run_with(folder: Path, pixels: dict[tuple[Any, int, int], int]) -> tuple[Analysis, Any]:
+def _run_with(folder: Path, *places: tuple[Any, int, int], count: int) -> tuple[Analysis, Any]:
     """Analyse a movie some of whose counts are replaced."""
     movie = folder / "movie.tif"
     truth = write_stack(_small(), movie)
     counts = tifffile.imread(movie)
-    for place, count in pixels.items():
+    for place in places:
         counts[place] = count
     tifffile.imwrite(movie, counts, photometric="minisblack")
     return fit_stack(movie, _small()), truth
@@ -333,7 +333,7 @@ def test_maps_of_gain_and_offset(tmp_path: Path) -> None:
 
 def test_a_dead_pixel_beside_a_particle_does_no_harm(tmp_path: Path) -> None:
     always = slice(None)
-    analysis, truth = _run_with(tmp_path, {(always, 21, 20): 0, (always, 48, 49): 0})
+    analysis, truth = _run_with(tmp_path, (always, 21, 20), (always, 48, 49), count=0)
     assert analysis.summary["masked_pixels"] == 2
     _assert_true(analysis.table, truth, "mass")
 
@@ -394,7 +394,7 @@ def test_neighbours_are_told_apart_and_flagged(tmp_path: Path) -> None:
 
 
 def test_saturation_beside_a_particle_is_flagged(tmp_path: Path) -> None:
-    analysis, truth = _run_with(tmp_path, {(40, 22, 21): 65535})
+    analysis, truth = _run_with(tmp_path, (40, 22, 21), count=65535)
     fits = _match(analysis.table, truth)
     assert fits["status"].tolist() == ["saturated", "ok"]
     assert any("saturated" in text for text in analysis.warnings)

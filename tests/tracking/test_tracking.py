@@ -20,6 +20,7 @@ import iscat_analysis as ia
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import make_context
+from iscat_analysis.fitting.run import Run
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline import analyse, fit_stack
@@ -157,7 +158,7 @@ def test_an_interrupt_keeps_the_frames_that_are_done(movie: tuple[Path, np.ndarr
             raise KeyboardInterrupt
 
     with open_stack(movie[0]) as stack:
-        cut = analyse(stack, _config(), progress=stop)
+        cut = analyse(stack, _config(), Run(progress=stop))
     assert cut.summary["interrupted"]
     assert sorted(cut.table["frame"].unique()) == list(range(BEFORE, BEFORE + 5))
 
