@@ -31,7 +31,7 @@ LARGEST_TEXT_BYTES = 10_000_000
 LARGEST_TEMPLATE_BYTES = 100_000_000
 """No measured picture of a particle is larger."""
 
-_OF_DAMAGE = (
+OF_DAMAGE = (
     OSError,
     EOFError,
     ValueError,
@@ -45,6 +45,8 @@ _OF_DAMAGE = (
     tokenize.TokenError,
     struct.error,
 )
+"""What damaged files make libraries raise."""
+
 _FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 _MOST_DOTS = 64  # of a key; tomllib takes the square of their number
 _DOT = re.compile(r"(?<!\.)\.(?!\.)")
@@ -133,7 +135,7 @@ def npz_of(content: bytes, names: Sequence[str], most: int) -> dict[str, NDArray
                 raise ValueError(f"its arrays are larger than {most} bytes")
         with np.load(io.BytesIO(content), allow_pickle=False) as stored:
             return {name: stored[name] for name in names or stored.files}
-    except (zipfile.BadZipFile, zlib.error, *_OF_DAMAGE) as error:
+    except (zipfile.BadZipFile, zlib.error, *OF_DAMAGE) as error:
         raise ValueError(first_line(error)) from None
 
 
@@ -156,5 +158,5 @@ def parquet_of(file: BinaryIO, columns: Sequence[str] | None = None) -> pd.DataF
 
     try:
         return pd.read_parquet(file, columns=None if columns is None else list(columns))
-    except (pa.ArrowException, *_OF_DAMAGE) as error:
+    except (pa.ArrowException, *OF_DAMAGE) as error:
         raise ValueError(first_line(error)) from None

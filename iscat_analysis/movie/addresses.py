@@ -58,10 +58,8 @@ def layout(part: str) -> Layout | None:
     if match is None:
         return None
     frames, rows, columns, name, header, order = match.groups()
-    return Layout(
-        int(frames) if frames else None, int(rows), int(columns), name, int(header or 0),
-        order == "columns",
-    )  # fmt: skip
+    number = int(frames) if frames else None
+    return Layout(number, int(rows), int(columns), name, int(header or 0), order == "columns")
 
 
 def setup_beside(address: Path) -> Path:

@@ -37,7 +37,7 @@ from iscat_analysis.records import StackMetadata
 from iscat_analysis.scratch import Scratch
 from iscat_analysis.units import listed
 
-_OF_ARCHIVES = (zipfile.BadZipFile, zlib.error, EOFError)
+_OF_ARCHIVES = (zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True)

@@ -95,26 +95,31 @@ TIME_FROM_HEIGHTS = (
 )
 """What a user should know of a movie whose file calls its frames heights."""
 
-LENGTH_NM = {
-    "pm": 1e-3, "å": 0.1, "angstrom": 0.1, "nm": 1.0, "nanometer": 1.0, "nanometers": 1.0,
-    "µm": 1e3, "μm": 1e3, "um": 1e3, "micron": 1e3, "microns": 1e3,
-    "micrometer": 1e3, "micrometers": 1e3, "mm": 1e6, "cm": 1e7, "inch": 2.54e7, "in": 2.54e7,
-    "m": 1e9,
-}  # fmt: skip
+
+def _units(*sizes: tuple[str, float]) -> dict[str, float]:
+    return {name: size for names, size in sizes for name in names.split()}
+
+
+LENGTH_NM = _units(
+    ("pm", 1e-3),
+    ("å angstrom", 0.1),
+    ("nm nanometer nanometers", 1.0),
+    ("µm μm um micron microns micrometer micrometers", 1e3),
+    ("mm", 1e6),
+    ("cm", 1e7),
+    ("inch in", 2.54e7),
+    ("m", 1e9),
+)
 """Nanometres in one unit of length, by its lower-case name (both Unicode micro signs)."""
 
-TIME_S = {
-    name: seconds
-    for names, seconds in (
-        ("ns nsec nanosecond nanoseconds", 1e-9),
-        ("µs μs us µsec μsec usec microsecond microseconds", 1e-6),
-        ("ms msec millisecond milliseconds", 1e-3),
-        ("s sec second seconds", 1.0),
-        ("min minute minutes", 60.0),
-        ("h hour hours", 3600.0),
-    )
-    for name in names.split()
-}
+TIME_S = _units(
+    ("ns nsec nanosecond nanoseconds", 1e-9),
+    ("µs μs us µsec μsec usec microsecond microseconds", 1e-6),
+    ("ms msec millisecond milliseconds", 1e-3),
+    ("s sec second seconds", 1.0),
+    ("min minute minutes", 60.0),
+    ("h hour hours", 3600.0),
+)
 """Seconds in one unit of time, by its lower-case name (both Unicode micro signs)."""
 
 _AXES = {"T": "time", "Z": "height", "C": "channel", "S": "sample", "P": "position"}
@@ -671,6 +676,10 @@ def _damaged(path: Path, how: str) -> DataError:
 LARGEST_NA = 2.0
 """Of any objective, solid immersion aside."""
 
+_OWN = (
+    "pixel_size_nm exposure_ms frame_rate_hz gain_e_per_adu offset_adu wavelength_nm na "
+    "magnification sensor_pixel_um"
+)
 _EVERYWHERE = {
     "actual gain e/adu": ("gain_e_per_adu", 1.0),  # Photometrics
     "conversion factor coeff": ("gain_e_per_adu", 1.0),  # Hamamatsu
@@ -690,14 +699,8 @@ _EVERYWHERE = {
     "exposure-ms": ("exposure_ms", 1.0),
     "interval_ms": ("interval_s", 1e-3),
     "pixelsizeum": ("pixel_size_nm", 1e3),
-    **{
-        name: (name, 1.0)
-        for name in (
-            "pixel_size_nm", "exposure_ms", "frame_rate_hz", "gain_e_per_adu", "offset_adu",
-            "wavelength_nm", "na", "magnification", "sensor_pixel_um",
-        )
-    },
-}  # fmt: skip
+    **{name: (name, 1.0) for name in _OWN.split()},
+}
 """Lower-case names that mean the same wherever they stand: the quantity, and its unit in theirs."""
 
 _SIF = {"exposuretime": ("exposure_ms", 1e3), "stackcycletime": ("interval_s", 1.0)}

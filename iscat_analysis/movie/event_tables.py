@@ -38,23 +38,22 @@ TEXTS = ("status", "rejected_by_hand")
 _WORDS = ("mass", "masses", "molecular_mass", "molecular_weight", "mw", "masse", "massen")
 _KDA = {"kda": 1.0, "da": 1e-3, "mda": 1e3}
 _PER_KDA = {f"{word}_{unit}": each for unit, each in _KDA.items() for word in _WORDS}
+_OURS = "systematic_mass_kda systematic_contrast snr n_after p_value track status rejected_by_hand"
 _NAMES: Mapping[str, Mapping[str, float]] = {
     "frame": dict.fromkeys(("frame_indices", "frame", "frames", "frame_index"), 1.0),
     "x_px": {"x_coords": 1.0, "x_px": 1.0},
     "y_px": {"y_coords": 1.0, "y_px": 1.0},
     "contrast": {"contrasts": 1.0, "contrast": 1.0, "kontrast": 1.0, "contrast_%": 0.01},
     "mass_kda": {
-        "mass_kda": 1.0, "masses_kda": 1.0, "calibrated_values": 1.0, **_PER_KDA,
+        **dict.fromkeys(("mass_kda", "masses_kda", "calibrated_values"), 1.0),
+        **_PER_KDA,
         **dict.fromkeys(_WORDS, math.nan),  # a row of units must say
     },
     "sigma_mass_kda": {f"sigma_mass_{unit}": each for unit, each in _KDA.items()},
-    **{name: {name: 1.0} for name in (
-        "systematic_mass_kda", "systematic_contrast", "snr", "n_after", "p_value", "track", *TEXTS
-    )},
-}  # fmt: skip
+    **{name: {name: 1.0} for name in _OURS.split()},
+}
 """What each column is called in the files, the first first, and what its values are times."""
 
-_OURS = ("fits.parquet", "fits.csv")
 _OF_TRACKPY = {"x", "y", "frame", "mass", "signal"}
 _CALIBRATIONS = (
     ("mass_model/c_1kDa", "mass_model/o_0kDa"),
@@ -112,7 +111,8 @@ def _file_of(path: Path) -> Path:
     """Give the table in an output folder, or the file itself."""
     if not is_folder(path):
         return path
-    inside = next((path / name for name in _OURS if is_file(path / name)), None)
+    files = (path / name for name in ("fits.parquet", "fits.csv"))
+    inside = next(filter(is_file, files), None)
     if inside is None:
         raise DataError(
             f"{path}: is a folder without fits.csv; give an output folder of iscat fit, or the "

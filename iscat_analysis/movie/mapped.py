@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import mmap
 import os
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from enum import Enum
@@ -17,13 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.reading import first_line, open_regular
+from iscat_analysis.reading import OF_DAMAGE, first_line, open_regular
 from iscat_analysis.records import InPlace
 
-WHAT_LIBRARIES_RAISE = (
-    ValueError, RuntimeError, TypeError, LookupError, OSError, ArithmeticError, MemoryError,
-    AttributeError, AssertionError, SystemError, struct.error,
-)  # fmt: skip
+WHAT_LIBRARIES_RAISE = (*OF_DAMAGE, AssertionError, SystemError)
 """What a damaged file makes tifffile, h5py and imagecodecs raise."""
 
 

@@ -22,7 +22,6 @@ from __future__ import annotations
 import glob
 import math
 import re
-import tokenize
 import warnings
 from contextlib import ExitStack
 from pathlib import Path
@@ -174,8 +173,7 @@ class Header(NamedTuple):
 def read_header(file: IO[bytes], path: Path) -> Header:
     """Read what comes before the numbers of an array, and not more."""
     what = f"{path}: begins like a NumPy array but is damaged"
-    errors = SyntaxError, tokenize.TokenError
-    with damaged(what, *errors, remedy="save it again"), warnings.catch_warnings():
+    with damaged(what, remedy="save it again"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of headers that Python 2 wrote, which are read
         version = npy.read_magic(file)
         shape, last_first, stored = _HEADERS[version](file)

@@ -28,23 +28,17 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.reading import first_line, is_folder, open_regular, read_bytes
 from iscat_analysis.records import FloatArray
 
-_SEPARATORS = ",;\t"
-_ONE_COLUMN = "\x1f"  # a separator that no table has
-_LARGEST = 2_000_000_000  # bytes
 _HEAD = 65536  # bytes that tell the encoding
 _LOOKED_AT = 50  # lines that tell the separator
-_ZEROS = 0.4  # of every other byte of UTF-16
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
 _CONTROL = re.compile("[\x00-\x08\x0e-\x1b\ufeff]")
-_NOTHING = frozenset(
-    ("", "-", "–", "—", "na", "n/a", "#n/a", "nan", "none", "null", "#num!", "#div/0!", "#value!",
-     "1.#qnan", "1.#ind", "-1.#ind")
-)  # fmt: skip
-"""What programs write where there is no number."""
+_NOTHING = " - – — na n/a #n/a nan none null #num! #div/0! #value! 1.#qnan 1.#ind -1.#ind"
+_EMPTY = frozenset(_NOTHING.split(" "))
+"""What programs write where there is no number, or nothing at all."""
 _GROUPED = re.compile(r"[-+]?[1-9]\d{0,2}(?:[.,]\d{3})+")  # 1,234 or 1.234.567
 _BETWEEN_DIGITS = re.compile(r"(?<=\d)[\s'\u2019](?=\d{3}(?!\d))")  # of 1 234 or 1'234
 
@@ -105,7 +99,7 @@ class Cells:
         ]
 
     def _number(self, name: str, row: int, cell: str, mark: str) -> float:
-        if cell.lower() in _NOTHING:
+        if cell.lower() in _EMPTY:
             return math.nan
         text, groups = cell, "." if mark == "," else ","
         if groups in text and _GROUPED.fullmatch(text.partition(mark)[0]):
@@ -134,7 +128,7 @@ def read_cells(
         Whether a row of units may stand below the headings.
     """
     try:
-        with open_regular(path, _LARGEST) as file:
+        with open_regular(path, 2_000_000_000) as file:
             head = file.read(_HEAD)
             file.seek(0)
             with io.TextIOWrapper(file, encoding_of(head), newline="") as lines:
@@ -192,7 +186,7 @@ def _encoding_of(head: bytes) -> str:
         if head.startswith(mark):
             return name
     even, odd = head[::2].count(0), head[1::2].count(0)
-    if max(even, odd) > _ZEROS * len(head) / 2 and min(even, odd) == 0:
+    if max(even, odd) > 0.2 * len(head) and min(even, odd) == 0:  # of half of the bytes
         return "utf-16-be" if even else "utf-16-le"
     try:
         codecs.getincrementaldecoder("utf-8")().decode(head)
@@ -217,8 +211,8 @@ def separator(lines: Sequence[str]) -> str:
             return 0, 0
         return sum(width == widths[0] for width in widths), widths[0]
 
-    found = [between for between in _SEPARATORS if lines and between in lines[0]]
-    return max(found, key=agreement) if found else _ONE_COLUMN
+    found = [between for between in ",;\t" if lines and between in lines[0]]
+    return max(found, key=agreement) if found else "\x1f"  # which no table has
 
 
 def refuse_twice(names: Sequence[object], used: Collection[str], table: object) -> None:
@@ -286,7 +280,7 @@ def _read(
 
 def _is_of_units(first: Sequence[Sequence[str]]) -> bool:
     """Tell whether the first of two rows holds units of the second: text, and no number at all."""
-    some = any(unit.strip().lower() not in _NOTHING and _is_number(value) for unit, value in first)
+    some = any(unit.strip().lower() not in _EMPTY and _is_number(value) for unit, value in first)
     return some and not any(_is_number(unit) for unit, _ in first)
 
 
@@ -301,7 +295,7 @@ def _is_number(cell: str) -> bool:
 def _proven_mark(cells: Iterable[str]) -> str | None:
     for cell in cells:
         marks = [sign for sign in cell if sign in ".,"]
-        if not marks or cell.lower() in _NOTHING:
+        if not marks or cell.lower() in _EMPTY:
             continue
         if len(set(marks)) == 2:
             return marks[-1]
@@ -319,6 +313,6 @@ def _all_grouped(cells: Sequence[str]) -> bool:
 
 def _likely_mark(cells: Sequence[str], *, whole: bool) -> str:
     """Choose the decimal mark where each number with a mark has three digits behind it."""
-    known = [cell for cell in cells if cell.lower() not in _NOTHING]
+    known = [cell for cell in cells if cell.lower() not in _EMPTY]
     commas = [cell for cell in known if "," in cell]
     return "," if commas and len(commas) == len(known) and not whole else "."
