@@ -165,10 +165,8 @@ def _single(context: AnalysisContext, moving: TrackedRows, chosen: IntArray) -> 
     side, theta = _side(context), rows.theta[chosen].copy()
     corner = np.rint(theta[:, 1::-1] / context.pixel_nm).astype(np.int64) - side // 2
     theta[:, :2] -= corner[:, ::-1] * context.pixel_nm
-    sums, owner = np.zeros((len(chosen), 3, side, side)), np.arange(len(chosen))
-    corner = np.ascontiguousarray(corner)
-    moving.field.add_squares(moving.ground, rows, chosen, corner, owner, sums)
-    left, light, read = np.moveaxis(sums, 1, 0)
+    owner = np.arange(len(chosen))
+    left, light, read = moving.field.superposed(moving.ground, rows, chosen, corner, owner, side)
     grid = PixelGrid.region((0, side), (0, side), context.pixel_nm)
     counts = left + light
     for number, (x, y, z, amplitude, _) in enumerate(theta.tolist()):
@@ -186,10 +184,8 @@ def _summed(context: AnalysisContext, moving: TrackedRows, chosen: IntArray) -> 
     key = (rows.track[chosen] * PHASES + part[:, 1]) * PHASES + part[:, 0]
     keys, index = np.unique(key, return_inverse=True)
     variance = variances_left(moving.judged.fisher[chosen], np.flatnonzero(field.free[:4]))
-    sums = np.zeros((len(keys), 3, side, side))
     corner = whole[:, ::-1] - side // 2
-    field.add_squares(ground, rows, chosen, np.ascontiguousarray(corner), index, sums)
-    left, light, read = np.moveaxis(sums, 1, 0)
+    left, light, read = field.superposed(ground, rows, chosen, corner, index, side)
     count = np.bincount(index)
     middle = [np.bincount(index, weights=v) / count for v in (places - whole).T]
     spread = np.bincount(index, weights=variance[:, :2].mean(axis=1)) / count

@@ -414,14 +414,18 @@ def load_field(
     total, light = exposures.in_electrons(total, frames), exposures.in_electrons(light, 1)
     masked = saturated | find_defects(total, frames * read)
     masked |= _noisy(exposures, light, total / frames + read)
-    nominal = abs(context.model.scale.amplitude(context.model.material.mass_kda))
-    free_z = context.mode == "joint"
     return MovingField(
-        exposures, read, ~masked, context.model, context.wide,
-        pixel_nm=context.pixel_nm, roi_px=context.roi_px,
-        z_range_nm=context.config.fit.z_range_nm if free_z else None,
-        largest=100 * nominal, pool=recording.pool, saturated=saturated,
-    )  # fmt: skip
+        exposures,
+        read,
+        ~masked,
+        context.model,
+        context.wide,
+        pixel_nm=context.pixel_nm,
+        roi_px=context.roi_px,
+        z_range_nm=context.config.fit.z_range_nm if context.mode == "joint" else None,
+        pool=recording.pool,
+        saturated=saturated,
+    )
 
 
 def refuse_few_frames(name: str, frames: int) -> None:

@@ -35,6 +35,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.background_response import Slopes, follow, own_shares, send
@@ -80,7 +81,7 @@ def ascend(
         step, gain = _damped_step(field, move, counts, damping)
         ground = BackgroundEstimate(found.level * np.exp(step - move), found.power)
         if gain < 0.05:  # expected gain of the step that is the last one
-            return field.followed(rows, step), ground, done
+            return field.response.followed(rows, step), ground, done
     return *kept, done
 
 
@@ -89,7 +90,7 @@ def _damped_step(
 ) -> tuple[FloatArray, float]:
     """Damp a Newton step until the likelihood is expected to rise; give the expected gain."""
     while True:
-        step = field.where_turns_end(move, damping)
+        step = field.response.step(move, field.total_e, field.used, damping)
         gain = 0.5 * float(np.sum(counts * move * step))
         if not gain <= 0 or not move.any():  # one that is no number climbs no better when damped
             return step, gain
@@ -162,7 +163,7 @@ def fit_jointly(
         move = np.where(field.used, np.log(found.level / ground.level), 0.0)
         last, length = length, float(np.linalg.norm(move / sigma))
         damping *= _DAMPING_UP if length > last else _DAMPING_DOWN if length < last / 2 else 1.0
-        step = field.where_turns_end(move, damping)
+        step = field.response.step(move, field.total_e, field.used, damping)
         if not coarse and np.linalg.norm(step / sigma) > MOST_STEP_RATIO * length:
             return ascend(field, ground, rows, follow_power=follow_power)
         before, change = change, float(np.abs(step / sigma)[field.used].max(initial=0.0))
@@ -175,7 +176,7 @@ def fit_jointly(
         elif change < least or change**2 < foreseen * before:
             break
     if follow_level:
-        rows = field.followed(rows, step)
+        rows = field.response.followed(rows, step)
     return rows, ground, done
 
 
@@ -246,8 +247,6 @@ class Coupling:
 _SINGULAR = 1e-9
 MOST_VARIANCE_LEFT_OUT = 3e-4  # of the variance of a row, that may be left out
 _MOST_AMPLITUDE_RATIO = 2.0  # amplitude over the mean, beyond which weights stay
-# Of the information on a mass, that a step of the conjugate gradients adds
-_LEAST_INFORMATION_SHARE = 1e-6
 MOST_STEPS = 400
 
 
@@ -411,7 +410,7 @@ def common_amplitudes(
         off = estimate - mean
         mode, sent_offset = coupling.sent(np.stack([sends, sends * off[:, None]], axis=1))
         total = weight.sum()
-        answer, taken = _solve_conjugate_gradients(coupling, covariance, mode, total)
+        answer, taken = _spread_over(coupling, covariance, mode)
         left = total - taken
         out[2:, k] = 1 / total, total**2 / np.sum(weight**2)
         if left > _SINGULAR * total:
@@ -433,30 +432,22 @@ def _at_their_mean(
     return mean, more
 
 
-def _solve_conjugate_gradients(
-    coupling: Coupling, covariance: FloatArray, image: FloatArray, total: float
+def _spread_over(
+    coupling: Coupling, covariance: FloatArray, image: FloatArray
 ) -> tuple[FloatArray, float]:
     """Solve (1 − E') answer = image by conjugate gradients; give image · answer as well.
 
-    That is infinite where 1 − E' is singular.
+    That is infinite where 1 − E' is singular: no eigenvalue of E' is negative.
     """
-    answer, taken = np.zeros_like(image), 0.0
-    left, direction = image.copy(), image.copy()
-    size = float(left @ left)
-    for _ in range(MOST_STEPS):
-        turned = direction - coupling.followed(covariance, direction[None])[1][0]
-        curvature = float(direction @ turned)
-        if not curvature > _SINGULAR * float(direction @ direction):
-            return answer, np.inf
-        step = size / curvature
-        answer += step * direction
-        taken += step * size
-        if step * size < _LEAST_INFORMATION_SHARE * (total - taken):
-            break
-        left -= step * turned
-        before, size = size, float(left @ left)
-        direction = left + size / before * direction
-    return answer, taken
+
+    def left(image: FloatArray) -> FloatArray:
+        return image - coupling.followed(covariance, image[None])[1][0]
+
+    square = (image.size, image.size)
+    operator = scipy.sparse.linalg.LinearOperator(square, left, dtype=np.float64)
+    answer, _ = scipy.sparse.linalg.cg(operator, image, rtol=1e-7, maxiter=MOST_STEPS)
+    taken = float(image @ answer)
+    return answer, taken if taken >= image @ image else np.inf
 
 
 def _marginal(fisher: FloatArray, others: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -20,6 +20,7 @@ from iscat_analysis._kernels.background_response import (
     join_rows,
 )
 from iscat_analysis._kernels.canvas import Light
+from iscat_analysis._kernels.moving import Search
 from iscat_analysis.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]
@@ -137,22 +138,16 @@ class Judged:
 
         Shapes: `free` (4,).
         """
-        n, index = len(fisher), np.flatnonzero(free)
-        part = np.ix_(np.arange(n), index, np.arange(index.size))
-        observed = np.full((n, 4, 4), np.nan)
-        inverse = np.full((n, index.size, index.size), np.nan)
+        index = np.flatnonzero(free)
+        part = np.ix_(np.arange(len(fisher)), index, np.arange(index.size))
         good = np.isfinite(turned[part]).all(axis=(1, 2))
-        if good.any():
-            v, ov = ways[part][good], turned[part][good]
-            inverse[good] = v @ np.swapaxes(v, 1, 2)
-            o = ov @ np.linalg.inv(v)
-            observed[np.ix_(good, index, index)] = (o + np.swapaxes(o, 1, 2)) / 2
-        shift = np.zeros((n, 4))
-        shift[:, index] = np.einsum("nij,nj->ni", inverse, bias[:, index])
-        gain, chi2, pixels, worst, level, growth = numbers.T
-        return cls(
-            fisher, observed, np.nan_to_num(shift), gain, chi2, pixels, worst, level, growth, slopes
-        )
+        square = np.ix_(good, index, index)
+        v, ov = ways[part][good], turned[part][good]
+        o = ov @ np.linalg.inv(v)
+        observed, shift = np.full(fisher.shape, np.nan), np.zeros(bias.shape)
+        observed[square] = (o + np.swapaxes(o, 1, 2)) / 2
+        shift[np.ix_(good, index)] = np.einsum("nik,njk,nj->ni", v, v, bias[good][:, index])
+        return cls(fisher, observed, shift, *numbers.T, slopes)
 
 
 _FARTHEST = 0.05  # step of the logarithm of the background
@@ -163,38 +158,43 @@ T = TypeVar("T")
 
 
 class Response:
-    """How rows follow the background, those that overlap together."""
+    """How rows follow the background, those that overlap together.
+
+    The expected information on the rows, and the counts of all their pixels, are those of the last
+    fit, whose box no row leaves.
+
+    Shapes: `starts` (t + 1,), `totals` (t, y, x), `information` (rows, free, free).
+    """
 
     def __init__(
         self,
         slopes: Slopes,
-        starts: NDArray[np.int64],
+        starts: IntArray,
         light: Light,
         totals: NDArray[np.float32],
         information: FloatArray,
+        search: Search,
         pool: ThreadPoolExecutor,
-        *,
-        joint: bool = False,
     ) -> None:
         self._slopes, self._pool = slopes, pool
+        self._index = np.flatnonzero(search.free[:4])
+        self._walls = search.lower[self._index], search.upper[self._index]
         owner = np.empty(starts[-1], dtype=np.int64)
         find_clusters(slopes.squares, starts, owner)
         rows = np.argsort(owner, kind="stable")
         firsts, count = np.unique(owner, return_counts=True)
         edges = np.append(0, np.cumsum(count))
-        corners = np.append(0, np.cumsum((slopes.values.shape[1] * count) ** 2))
+        corners = np.append(0, np.cumsum((self._index.size * count) ** 2))
         frame = np.searchsorted(starts, firsts, side="right") - 1
-        factors, steps = np.empty(corners[-1]), np.zeros(slopes.moves.shape if joint else (0, 0))
+        factors, steps = np.empty(corners[-1]), np.zeros(slopes.moves.shape)
         self._clusters = Clusters(rows, edges, frame, corners, factors, steps)
         k, area = slopes.values.shape[1:]
         self._largest = n = k * int(count.max(initial=0))
 
         def join(a: int, b: int) -> None:
-            join_rows(
-                slopes, self._clusters, light, totals, information, a, b,
-                np.empty(2 * n * n + 2 * n + k * k), np.empty(n, dtype=np.int64),
-                np.empty((1 + 2 * k, area), dtype=np.float32),
-            )  # fmt: skip
+            place, lines = np.empty(n, np.int64), np.empty((1 + 2 * k, area), np.float32)
+            room = np.empty(2 * n * n + 2 * n + k * k), place, lines
+            join_rows(slopes, self._clusters, light, totals, information, a, b, *room)
 
         self._share(join)
 
@@ -203,14 +203,18 @@ class Response:
         edges = np.linspace(0, len(self._clusters.frame), 8 + 1).astype(int).tolist()
         return list(self._pool.map(lambda part: task(*part), pairwise(edges)))
 
-    def _room(self) -> tuple[NDArray[np.float32], FloatArray]:
-        """Room for a square and for the steps of a cluster."""
-        return np.empty(self._slopes.values.shape[2], dtype=np.float32), np.empty(self._largest)
+    def _follow(
+        self, first: int, last: int, image: FloatArray, steps: FloatArray, out: FloatArray
+    ) -> None:
+        """Let some clusters follow an image of the background's logarithm, and draw that."""
+        square = np.empty(self._slopes.values.shape[2], dtype=np.float32)
+        room = square, np.empty(self._largest)
+        follow_rows(self._slopes, self._clusters, first, last, image, steps, out, *room)
 
     def step(
         self, move: FloatArray, total: FloatArray, used: BoolArray, damping: float
     ) -> FloatArray:
-        """Tell where turns of background and rows would end.
+        """Extrapolate all further turns of background and rows from the first one, `move`.
 
         The rows follow the background and the background them: what a step δ leaves over is
         move − δ + N⁻¹ Σ Gᵀ F⁻¹ G δ.  It vanishes where M δ = N move; the conjugate gradients that
@@ -225,9 +229,7 @@ class Response:
 
             def taken(first: int, last: int) -> FloatArray:
                 out = np.zeros(used.shape)
-                follow_rows(
-                    self._slopes, self._clusters, first, last, image, room, out, *self._room()
-                )
+                self._follow(first, last, image, room, out)
                 return out
 
             out = (1 + damping) * counts * image
@@ -236,60 +238,42 @@ class Response:
             return np.where(used, out, image).ravel()
 
         weight = np.where(used, np.maximum(counts, 1.0), 1.0).ravel()
-        square = (move.size, move.size)
-        of = scipy.sparse.linalg
-        step, _ = of.cg(
-            of.LinearOperator(square, undetermined, dtype=np.float64),
-            (counts * move).ravel(),
-            rtol=0.02,  # of a step that is left to the next
-            maxiter=40,  # of the conjugate gradients
-            M=of.LinearOperator(square, lambda v: v.ravel() / weight, dtype=np.float64),
+        operator, square = scipy.sparse.linalg.LinearOperator, (move.size, move.size)
+        lost = operator(square, undetermined, dtype=np.float64)
+        guess = operator(square, lambda v: v.ravel() / weight, dtype=np.float64)
+        # 0.02 of a step is left to the next
+        step, _ = scipy.sparse.linalg.cg(
+            lost, (counts * move).ravel(), rtol=0.02, maxiter=40, M=guess
         )
         return np.asarray(np.clip(step.reshape(move.shape), -_FARTHEST, _FARTHEST))
 
-    def followed(
-        self,
-        theta: FloatArray,
-        step: FloatArray,
-        free: BoolArray,
-        walls: tuple[FloatArray, FloatArray],
-    ) -> FloatArray:
+    def followed(self, rows: Localizations, step: FloatArray) -> Localizations:
         """Let rows follow a step of the background, to first order.
 
-        Shapes: `theta` (rows, 5), `step` (y, x), `free` (5,), result (rows, 5).
+        Shapes: `step` (y, x).
         """
         steps, nowhere = np.empty_like(self._slopes.units), np.empty((0, 0))
-        self._share(
-            lambda a, b: follow_rows(
-                self._slopes, self._clusters, a, b, step, steps, nowhere, *self._room()
-            )
-        )
-        out, index = theta.copy(), np.flatnonzero(free[:4])
-        low, high = (wall[index] for wall in walls)
-        out[:, index] = np.clip(theta[:, index] - steps, low, high)
-        return out
+        self._share(lambda a, b: self._follow(a, b, step, steps, nowhere))
+        theta, index = rows.theta.copy(), self._index
+        theta[:, index] = np.clip(theta[:, index] - steps, *self._walls)
+        return replace(rows, theta=theta)
 
-    def together(
-        self, theta: FloatArray, free: BoolArray, walls: tuple[FloatArray, FloatArray]
-    ) -> FloatArray:
+    def together(self, rows: Localizations) -> Localizations:
         """Let rows that overlap follow one another, to first order.
 
         Each was fitted with the others as they were then; those that came after it have moved.
-
-        Shapes: result (rows, 5).
         """
-        out, index = theta.copy(), np.flatnonzero(free[:4])
-        count = np.diff(self._clusters.edges)
-        rows = self._clusters.rows[np.repeat(count > 1, count)]
-        if rows.size:
-            count = count[count > 1]
-            here, steps = theta[np.ix_(rows, index)], self._clusters.steps[rows]
-            most = np.broadcast_to(_LONGEST[index], here.shape).copy()
-            most[:, index == 3] *= np.abs(here[:, index == 3])
-            length = np.abs(steps)
-            share = np.divide(most, length, out=np.ones_like(most), where=length > most)
-            share = np.minimum.reduceat(share.min(axis=1), np.cumsum(count) - count)
-            low, high = (wall[index] for wall in walls)
-            here = here + np.repeat(share, count)[:, None] * steps
-            out[np.ix_(rows, index)] = np.clip(here, low, high)
-        return out
+        count, index = np.diff(self._clusters.edges), self._index
+        several = self._clusters.rows[np.repeat(count > 1, count)]
+        if not several.size:
+            return rows
+        count, theta = count[count > 1], rows.theta.copy()
+        here, steps = theta[np.ix_(several, index)], self._clusters.steps[several]
+        most = np.broadcast_to(_LONGEST[index], here.shape).copy()
+        most[:, index == 3] *= np.abs(here[:, index == 3])
+        length = np.abs(steps)
+        share = np.divide(most, length, out=np.ones_like(most), where=length > most)
+        share = np.minimum.reduceat(share.min(axis=1), np.cumsum(count) - count)
+        here = here + np.repeat(share, count)[:, None] * steps
+        theta[np.ix_(several, index)] = np.clip(here, *self._walls)
+        return replace(rows, theta=theta)

@@ -65,7 +65,7 @@ def _field(model: ForwardModel, counts: np.ndarray, pool: ThreadPoolExecutor) ->
     return MovingField(
         Exposures(counts.astype(np.float32)), np.zeros(SHAPE), np.ones(SHAPE, dtype=bool), model,
         model,
-        pixel_nm=PIXEL_NM, roi_px=ROI, z_range_nm=None, largest=1e6, pool=pool,
+        pixel_nm=PIXEL_NM, roi_px=ROI, z_range_nm=None, pool=pool,
     )  # fmt: skip
 
 

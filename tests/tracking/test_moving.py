@@ -19,6 +19,7 @@ from scenes import PIXEL_NM, make_config
 from iscat_analysis._kernels.background_response import Slopes, keep_slopes
 from iscat_analysis._kernels.canvas import Light
 from iscat_analysis._kernels.hessian import first_order_bias
+from iscat_analysis._kernels.moving import Search
 from iscat_analysis._kernels.stamp import add_stamp
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
@@ -108,7 +109,7 @@ def _field(
     return MovingField(
         counts, np.full(SHAPE, read_e2), np.ones(SHAPE, dtype=bool),
         near, forward_model(config, 1e4), pixel_nm=PIXEL_NM, roi_px=ROI, z_range_nm=None,
-        largest=1e6, pool=pool,
+        pool=pool,
     )  # fmt: skip
 
 
@@ -355,7 +356,7 @@ def test_rows_follow_a_step_of_their_background(
     for _ in range(3):
         truth, _, _ = field.fit(ground, truth, sweeps=6)
     step = 1e-3 * np.random.default_rng(2).standard_normal(SHAPE)  # two thirds of a frame's noise
-    foreseen = field.followed(truth, step).theta - truth.theta
+    foreseen = field.response.followed(truth, step).theta - truth.theta
     field = _field(counts, pool)
     rows = truth
     for _ in range(3):
@@ -381,14 +382,14 @@ def test_rows_in_one_place_follow_as_one(pool: ThreadPoolExecutor, rounded: floa
         np.full((side, side), level), np.zeros((side, side)),
     )  # fmt: skip
     own = float(np.sum(slope**2)) / level
-    response = Response(
-        slopes, np.array([0, 2]), light, np.zeros((1, side, side), dtype=np.float32),
-        np.full((2, 1, 1), rounded * own), pool,
-    )  # fmt: skip
-    free = np.array([False, False, False, True, False])
-    walls = np.full(5, -np.inf), np.full(5, np.inf)
-    move = slope.reshape(side, side) / level
-    moved = response.followed(np.zeros((2, 5)), move, free, walls)[:, 3]
+    free, nothing = np.array([False, False, False, True, False]), np.zeros(2, dtype=int)
+    wide = np.full(5, np.inf)
+    search = Search(free, wide, -wide, wide, wide, 0.0, 0)
+    information = np.full((2, 1, 1), rounded * own)
+    drawn = np.zeros((1, side, side), dtype=np.float32)
+    response = Response(slopes, np.array([0, 2]), light, drawn, information, search, pool)
+    rows = Localizations.of(nothing, np.arange(2), np.zeros((2, 5)))
+    moved = response.followed(rows, slope.reshape(side, side) / level).theta[:, 3]
     assert moved == pytest.approx(-0.5, rel=0.05)
 
 
@@ -529,8 +530,8 @@ def test_squares_are_put_on_top_of_each_other(pool: ThreadPoolExecutor) -> None:
     corner = np.rint(rows.theta[which, 1::-1] / PIXEL_NM).astype(np.int64) - side // 2
     corner[3] = -4, SHAPE[1] - 3
     owner = np.array([0, 1, 0, 2, 1])
-    sums, slow = np.zeros((3, 3, side, side)), np.zeros((3, 3, side, side))
-    field.add_squares(ground, rows, which, corner, owner, sums)
+    slow = np.zeros((3, 3, side, side))
+    sums = np.moveaxis(field.superposed(ground, rows, which, corner, owner, side), 0, 1)
     for row, (top, left), k in zip(which, corner, owner, strict=True):
         t = rows.frame[row]
         over = field.residual(ground, rows, t, t + 1)[0]

@@ -50,7 +50,7 @@ def test_rows_come_into_their_fringe(
         field = MovingField(
             Exposures(rng.poisson(mean).astype(np.float32)), np.zeros(SHAPE),
             np.ones(SHAPE, dtype=bool), near, model, pixel_nm=PIXEL_NM, roi_px=ROI,
-            z_range_nm=span, largest=1e9, pool=pool,
+            z_range_nm=span, pool=pool,
         )  # fmt: skip
         ground = BackgroundEstimate(np.full(SHAPE, LEVEL_E), np.ones(FRAMES))
         rows = Localizations.of(frames, track, start)
