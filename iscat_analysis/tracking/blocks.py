@@ -24,7 +24,6 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
 from itertools import pairwise
 
 import numpy as np
@@ -55,7 +54,7 @@ from iscat_analysis.tracking.linking import (
     bridge,
     link,
     numbered,
-    typical,
+    track_ends,
     typical_error,
     with_mass,
 )
@@ -115,37 +114,65 @@ class Aligned:
         x, y, z = (float(v) for v in theta[:3])
         signal = likelihood.signal(theta)
         return ParticleImage(
-            grid=likelihood.grid, noise=likelihood.noise, data=likelihood.data,
-            x_nm=x, y_nm=y, z_nm=z, mass_kda=float(context.model.scale.mass(theta[3])),
+            grid=likelihood.grid,
+            noise=likelihood.noise,
+            data=likelihood.data,
+            x_nm=x,
+            y_nm=y,
+            z_nm=z,
+            mass_kda=float(context.model.scale.mass(theta[3])),
             snr=float(np.sqrt(np.sum(signal**2 * likelihood.signal_information(signal)))),
             owner=int(self.track[number]),
             heights_nm=fit.z_range_nm if fit.mode == "joint" else None,
-        )  # fmt: skip
+        )
 
 
 def align(context: AnalysisContext, moving: TrackedRows) -> Aligned:
-    """Superpose the frames of the brightest tracks."""
-    side = _side(context)
-    empty = np.zeros((0, side, side))
-    nothing = np.zeros(0, dtype=np.int64)
-    none = Aligned(nothing, empty, empty, empty, np.zeros((0, 5)), nothing)
-    rows, field = moving.rows, moving.field
-    if not len(rows.frame):
-        return none
-    good = moving.converged & ~moving.close & field.holds(rows.theta)
-    if field.free[2]:
+    """Superpose the frames of the brightest tracks, or take single ones where heights are free."""
+    rows, field, pixel = moving.rows, moving.field, context.pixel_nm
+    side = (context.roi_px - 1) // 2 * 2 + 1  # so that a pixel is in the middle
+    heights_free = bool(field.free[2])
+    good = moving.done & ~moving.close & field.holds(rows.theta)
+    if heights_free:
         good &= (rows.snr > FAINTEST) & (moving.smear_nm < MOST_SMEARED_NM)
     else:
         good &= np.isfinite(moving.common.amplitude)[rows.track]
     chosen = np.flatnonzero(_brightest(rows.track, rows.snr, good))
     if not len(chosen):
-        return none
-    return _single(context, moving, chosen) if field.free[2] else _summed(context, moving, chosen)
+        empty, nothing = np.zeros((0, side, side)), np.zeros(0, dtype=np.int64)
+        return Aligned(nothing, empty, empty, empty, np.zeros((0, 5)), nothing)
+    if heights_free:  # from all heights alike
+        ranked = chosen[np.argsort(rows.theta[chosen, 2], kind="stable")]
+        some = np.linspace(0, len(ranked) - 1, min(MOST_SINGLE, len(ranked))).round().astype(int)
+        chosen = np.sort(ranked[some])
+    places, track = rows.theta[chosen, :2] / pixel, rows.track[chosen]
+    whole = np.rint(places).astype(np.int64)
+    owner = np.arange(len(chosen))
+    if not heights_free:  # by track and part of the pixel
+        part = np.floor((places - whole + 0.5) * PHASES).clip(0, PHASES - 1).astype(np.int64)
+        key = (track * PHASES + part[:, 1]) * PHASES + part[:, 0]
+        owner = np.unique(key, return_inverse=True)[1]
+    count = np.bincount(owner)
 
+    def mean(values: FloatArray) -> FloatArray:
+        return np.bincount(owner, weights=values) / count
 
-def _side(context: AnalysisContext) -> int:
-    """Largest odd side within the fitted square, so that a pixel is in the middle."""
-    return (context.roi_px - 1) // 2 * 2 + 1
+    track = track[np.unique(owner, return_index=True)[1]]
+    theta = np.zeros((len(count), 5))
+    theta[:, :2] = np.transpose([mean(v) + side // 2 for v in (places - whole).T]) * pixel
+    if heights_free:
+        spread, theta[:, 2:4] = np.zeros(len(count)), rows.theta[chosen, 2:4]
+    else:
+        variance = variances_left(moving.judged.fisher[chosen], np.flatnonzero(field.free[:4]))
+        spread = mean(variance[:, :2].mean(axis=1))
+        theta[:, 2], theta[:, 3] = context.model.height_nm, moving.common.amplitude[track]
+    corner, grid = whole[:, ::-1] - side // 2, PixelGrid.region((0, side), (0, side), pixel)
+    left, light, read = field.superposed(moving.ground, rows, chosen, corner, owner, side)
+    counts = left + light
+    for number, (x, y, z, amplitude, _) in enumerate(theta.tolist()):
+        unsure = blurred(context.model, float(spread[number]), upwards=False)
+        counts[number] += light[number] * unsure.amplitude_image(grid, x, y, z, amplitude)
+    return Aligned(track, counts, light, read, theta, count.astype(np.int64))
 
 
 def _brightest(track: IntArray, snr: FloatArray, good: BoolArray) -> BoolArray:
@@ -154,51 +181,6 @@ def _brightest(track: IntArray, snr: FloatArray, good: BoolArray) -> BoolArray:
     enough = np.bincount(track, weights=good) >= LEAST_FRAMES
     best = np.argsort(-np.where(enough, energy, -1.0), kind="stable")[:MOST_TRACKS]
     return np.asarray(good & np.isin(track, best[enough[best]]))
-
-
-def _single(context: AnalysisContext, moving: TrackedRows, chosen: IntArray) -> Aligned:
-    """Take single frames, from all heights alike."""
-    rows = moving.rows
-    ranked = chosen[np.argsort(rows.theta[chosen, 2], kind="stable")]
-    some = np.linspace(0, len(ranked) - 1, min(MOST_SINGLE, len(ranked))).round().astype(np.int64)
-    chosen = np.sort(ranked[some])
-    side, theta = _side(context), rows.theta[chosen].copy()
-    corner = np.rint(theta[:, 1::-1] / context.pixel_nm).astype(np.int64) - side // 2
-    theta[:, :2] -= corner[:, ::-1] * context.pixel_nm
-    owner = np.arange(len(chosen))
-    left, light, read = moving.field.superposed(moving.ground, rows, chosen, corner, owner, side)
-    grid = PixelGrid.region((0, side), (0, side), context.pixel_nm)
-    counts = left + light
-    for number, (x, y, z, amplitude, _) in enumerate(theta.tolist()):
-        counts[number] += light[number] * context.model.amplitude_image(grid, x, y, z, amplitude)
-    return Aligned(rows.track[chosen], counts, light, read, theta, np.ones(len(chosen), np.int64))
-
-
-def _summed(context: AnalysisContext, moving: TrackedRows, chosen: IntArray) -> Aligned:
-    """Add up what is left over of rows, by track and part of the pixel."""
-    rows, field, ground = moving.rows, moving.field, moving.ground
-    side, pixel = _side(context), context.pixel_nm
-    places = rows.theta[chosen, :2] / pixel
-    whole = np.rint(places).astype(np.int64)
-    part = np.floor((places - whole + 0.5) * PHASES).clip(0, PHASES - 1).astype(np.int64)
-    key = (rows.track[chosen] * PHASES + part[:, 1]) * PHASES + part[:, 0]
-    keys, index = np.unique(key, return_inverse=True)
-    variance = variances_left(moving.judged.fisher[chosen], np.flatnonzero(field.free[:4]))
-    corner = whole[:, ::-1] - side // 2
-    left, light, read = field.superposed(ground, rows, chosen, corner, index, side)
-    count = np.bincount(index)
-    middle = [np.bincount(index, weights=v) / count for v in (places - whole).T]
-    spread = np.bincount(index, weights=variance[:, :2].mean(axis=1)) / count
-    track = keys // PHASES**2
-    theta = np.zeros((len(keys), 5))
-    theta[:, 0], theta[:, 1] = ((v + side // 2) * pixel for v in middle)
-    theta[:, 2], theta[:, 3] = context.model.height_nm, moving.common.amplitude[track]
-    grid = PixelGrid.region((0, side), (0, side), pixel)
-    counts = left + light
-    for number, (x, y, z, amplitude, _) in enumerate(theta.tolist()):
-        unsure = blurred(context.model, float(spread[number]), upwards=False)
-        counts[number] += light[number] * unsure.amplitude_image(grid, x, y, z, amplitude)
-    return Aligned(track, counts, light, read, theta, count.astype(np.int64))
 
 
 @dataclass(frozen=True)
@@ -388,7 +370,7 @@ def join_tracks(config: Config, blocks: Sequence[Block]) -> list[IntArray]:
         for before, after in _met(config, one, two):
             numbers[k + 1][after] = numbers[k][before]
     rows = [replace(b.rows, track=n[b.rows.track]) for n, b in zip(numbers, blocks, strict=True)]
-    whole = reduce(_both, rows)
+    whole = Localizations.together(rows).in_order()
     if not len(whole.frame):
         return numbers
     bridged = replace(whole, track=bridge(config, whole))
@@ -401,34 +383,18 @@ def join_tracks(config: Config, blocks: Sequence[Block]) -> list[IntArray]:
 def _met(config: Config, one: Block, two: Block) -> list[tuple[int, int]]:
     """Find pairs of tracks of two blocks, where the second continues the first."""
     border, memory = two.span[0], config.track.memory_frames
-    ends, begins = _ends(one.rows, -1), _ends(two.rows, 0)
+    ends, begins = track_ends(one.rows, -1), track_ends(two.rows, 0)
     ends = ends.only(ends.frame >= border - 1 - memory)
     begins = begins.only(begins.frame <= border + memory)
     if not len(ends.frame) or not len(begins.frame):
         return []
-    both = _both(ends, begins)
-    side = np.repeat([0, 1], [len(ends.frame), len(begins.frame)])
+    both, early = Localizations.together([ends, begins]), len(ends.frame)
+    side = (np.arange(len(both.frame)) >= early).astype(np.int64)
     places = with_mass(config, both, np.hypot(one.error, two.error) / np.sqrt(2))
     track = link(side, places, reach_nm=config.track.max_step_nm, memory=0)
-    pairs = []
-    for j in np.flatnonzero(side == 1):
-        for i in np.flatnonzero((side == 0) & (track == track[j])):
-            if both.frame[j] - both.frame[i] - 1 <= memory:
-                pairs.append((int(both.track[i]), int(both.track[j])))
-    return pairs
-
-
-def _ends(rows: Localizations, which: int) -> Localizations:
-    """First (0) or last (−1) row of every track, with the median mass of the track."""
-    order = np.lexsort((rows.frame, rows.track))
-    edges = np.flatnonzero(np.diff(rows.track[order], prepend=-1, append=-1))
-    chosen = order[edges[:-1] if which == 0 else edges[1:] - 1]
-    return typical(rows).only(chosen)
-
-
-def _both(one: Localizations, two: Localizations) -> Localizations:
-    """Join rows, the ones before the others."""
-    return one.joined(two.frame, two.track, two.theta, two.group)
+    old, new = np.nonzero(track[:early, None] == track[early:])
+    short = begins.frame[new] - ends.frame[old] - 1 <= memory
+    return list(zip(ends.track[old[short]], begins.track[new[short]], strict=True))
 
 
 def combine_masses(
@@ -459,16 +425,13 @@ def _views(
     if not len(table):
         return ()
     best = table.loc[table.groupby("track")["snr"].idxmax()]
-    edges = np.array([b.span[1] for b in blocks])
-    found = []
-    for row in best.itertuples():
-        k = int(np.searchsorted(edges, row.frame, side="right"))
-        found += [
-            replace(view, event=int(row.track))
-            for view in blocks[k].views
-            if numbers[k][view.event] == row.track
-        ][:1]
-    return tuple(found)
+    block = np.searchsorted([b.span[1] for b in blocks], best["frame"], side="right")
+    views: dict[tuple[int, int], EventView] = {}
+    for k, (own, of_block) in enumerate(zip(numbers, blocks, strict=True)):
+        for view in reversed(of_block.views):
+            views[k, int(own[view.event])] = view
+    keys = zip(block.tolist(), best["track"].tolist(), strict=True)
+    return tuple(replace(views[key], event=key[1]) for key in keys if key in views)
 
 
 def _together(blocks: Sequence[Block], parts: Sequence[Windows]) -> Windows:
@@ -477,18 +440,18 @@ def _together(blocks: Sequence[Block], parts: Sequence[Windows]) -> Windows:
         return parts[0]
     frames, span = sum(b.frames for b in blocks), (blocks[0].span[0], blocks[-1].span[1])
     light: FloatArray = np.concatenate([b.power * b.level[b.used].mean() for b in blocks])
-    power = light / light.mean()
-    return replace(
-        parts[0],
-        before_e=sum((p.before_e for p in parts[1:]), parts[0].before_e),
-        after_e=sum((p.after_e for p in parts[1:]), parts[0].after_e),
+    read = frames / blocks[0].frames * parts[0].read_variance_before_e2
+    return Windows(
+        before_e=np.sum([p.before_e for p in parts], axis=0),
+        after_e=np.sum([p.after_e for p in parts], axis=0),
         n_before=frames,
         n_after=frames,
-        read_variance_before_e2=frames / blocks[0].frames * parts[0].read_variance_before_e2,
-        read_variance_after_e2=frames / blocks[0].frames * parts[0].read_variance_after_e2,
+        power_ratio=1.0,
+        read_variance_before_e2=read,
+        read_variance_after_e2=read,
         masked=np.logical_or.reduce([p.masked for p in parts]),
         saturated=np.logical_or.reduce([p.saturated for p in parts]),
         frames_before=span,
         frames_after=span,
-        power=np.concatenate([power, power]),
+        power=np.tile(light / light.mean(), 2),
     )

@@ -28,12 +28,13 @@ from __future__ import annotations
 import logging
 import math
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 import scipy
 from numpy.typing import NDArray
 
@@ -41,9 +42,15 @@ from iscat_analysis._kernels.moving import link_surely
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext
+from iscat_analysis.medians import SIGMA_PER_MAD
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.tracking.field import MovingField
-from iscat_analysis.tracking.rows import BackgroundEstimate, Judged, Localizations
+from iscat_analysis.tracking.rows import (
+    BackgroundEstimate,
+    Judged,
+    Localizations,
+    medians_of_tracks,
+)
 
 IntArray = NDArray[np.int64]
 
@@ -55,92 +62,14 @@ LEAST_SHARE = 0.5
 
 # Resolutions λ/NA within which particles are fitted from their predictions
 _MEETING_RESOLUTIONS = 1.5
-_SAME_RESOLUTIONS = 0.25  # resolutions within which two rows are one particle
 
 
-@dataclass(frozen=True)
-class _End:
+class _End(NamedTuple):
     """An open end of a track: the frame of its last row there, and the direction."""
 
     track: int
     frame: int
     direction: int
-
-
-def extended(
-    field: MovingField,
-    ground: BackgroundEstimate,
-    rows: Localizations,
-    *,
-    resolution_nm: float,
-    reach_nm: float,
-) -> tuple[Localizations, int]:
-    """Continue tracks beyond their ends as long as the movie shows their particles."""
-    tracks = int(rows.track.max(initial=-1)) + 1
-    if not tracks:
-        return rows, 0
-    blur = np.zeros(tracks, dtype=np.int64)
-    blur[rows.track] = rows.group
-    frames, typical, ends = _Frames(rows, field.frames), np.zeros(tracks), []
-    for k in range(tracks):
-        mine = np.flatnonzero(rows.track == k)
-        typical[k] = np.median(rows.theta[mine, 3])
-        ends += [_End(k, int(rows.frame[mine[-1]]), 1), _End(k, int(rows.frame[mine[0]]), -1)]
-    refitted: dict[int, Localizations] = {}
-    added = 0
-    meeting, same = _MEETING_RESOLUTIONS * resolution_nm, _SAME_RESOLUTIONS * resolution_nm
-    while ends:
-        proposed: dict[int, dict[int, _End]] = {}
-        for end in ends:
-            t = end.frame + end.direction
-            if not 0 <= t < field.frames or end.track in frames[t]:
-                continue
-            here = frames[end.frame][end.track]
-            newborn = any(
-                k not in frames[end.frame] and np.hypot(*(theta - here)[:2]) < same
-                for k, theta in frames[t].items()
-            )
-            if field.holds(here) and not newborn:
-                proposed.setdefault(t, {})[end.track] = end
-        if not proposed:
-            break
-        trial = _starts(frames, proposed, typical, blur, meeting)
-        fitted, done = field.refit(ground, trial, sweeps=6)
-        good = done & (fitted.snr > LEAST_SNR)
-        ends = []
-        for t, new in proposed.items():
-            of_frame = np.flatnonzero(fitted.frame == t)
-            found = {int(fitted.track[i]): fitted.theta[i] for i in of_frame}
-            sure = {int(fitted.track[i]): bool(good[i]) for i in of_frame}
-            accepted = []
-            for k, end in new.items():
-                theta, last = found[k], frames[end.frame][k]
-                distances = [np.hypot(*(theta - o)[:2]) for j, o in found.items() if j != k]
-                alone = min(distances, default=np.inf) > meeting
-                heavy = theta[3] > LEAST_SHARE * typical[k]
-                step = np.hypot(*(theta - last)[:2])
-                apart = min(distances, default=np.inf) > same
-                if sure[k] and (alone or heavy) and apart and step < reach_nm:
-                    accepted.append(end)
-            if not accepted:
-                continue
-            for k, theta in found.items():
-                if k in frames[t] or k in {end.track for end in accepted}:
-                    frames[t][k] = theta
-            added += len(accepted)
-            refitted[t] = fitted.only(of_frame)
-            ends += [_End(end.track, t, end.direction) for end in accepted]
-    rows = replace(rows, group=blur[rows.track])
-    if not refitted:
-        return rows, 0
-    changed = sorted(refitted)
-    frame = np.array([t for t in changed for _ in frames[t]], dtype=np.int64)
-    track = np.array([k for t in changed for k in frames[t]], dtype=np.int64)
-    theta = np.array([theta for t in changed for theta in frames[t].values()])
-    longer = Localizations.of(frame, track, theta, blur[track]).recalling(rows)
-    longer = longer.recalling(Localizations.together([refitted[t] for t in changed]))
-    others = rows.only(~np.isin(rows.frame, changed))
-    return Localizations.together([others, longer]).in_order(), added
 
 
 class _Frames(dict[int, dict[int, FloatArray]]):
@@ -157,31 +86,92 @@ class _Frames(dict[int, dict[int, FloatArray]]):
         return self[t]
 
 
-def _starts(
-    frames: _Frames,
-    proposed: dict[int, dict[int, _End]],
-    typical: FloatArray,
-    blur: np.ndarray,
-    meeting_nm: float,
-) -> Localizations:
-    """Give the starting rows of frames into which tracks are extended, with their neighbours."""
-    frame, track, theta = [], [], []
-    for t, new in proposed.items():
-        rows = {k: value.copy() for k, value in frames[t].items()}
+def _apart(one: FloatArray, other: FloatArray) -> float:
+    """Distance of two particles in the plane [nm]."""
+    return math.hypot(*(one - other)[:2])
+
+
+def extended(
+    field: MovingField,
+    ground: BackgroundEstimate,
+    rows: Localizations,
+    *,
+    resolution_nm: float,
+    reach_nm: float,
+) -> tuple[Localizations, int]:
+    """Continue tracks beyond their ends as long as the movie shows their particles."""
+    if not len(rows.frame):
+        return rows, 0
+    begun, ended = track_ends(rows, 0), track_ends(rows, -1)
+    typical, blur = ended.theta[:, 3], ended.group
+    ends = [_End(k, t, 1) for k, t in enumerate(ended.frame.tolist())]
+    ends += [_End(k, t, -1) for k, t in enumerate(begun.frame.tolist())]
+    frames, refitted, added = _Frames(rows, field.frames), dict[int, Localizations](), 0
+    meeting_nm, same_nm = _MEETING_RESOLUTIONS * resolution_nm, resolution_nm / 4
+
+    def with_neighbours(t: int, new: dict[int, _End]) -> dict[int, FloatArray]:
+        """Give starts of fits: the last places of what is new in a frame, and of what is near."""
+        starts = dict(frames[t])
         for k, end in new.items():
-            start = frames[end.frame][k].copy()
-            start[3] = typical[k]
-            for j, other in frames[t].items():
-                if np.hypot(*(other - start)[:2]) < meeting_nm:
-                    rows[j] = frames[end.frame].get(j, other).copy()
-                    rows[j][3] = typical[j]
-            rows[k] = start
-        for k, value in rows.items():
-            frame.append(t)
-            track.append(k)
-            theta.append(value)
-    tracks = np.array(track, dtype=np.int64)
-    return Localizations.of(np.array(frame, dtype=np.int64), tracks, np.array(theta), blur[tracks])
+            last = frames[end.frame]
+            near = [j for j in frames[t] if _apart(frames[t][j], last[k]) < meeting_nm]
+            for j in (k, *near):
+                starts[j] = last.get(j, frames[t].get(j)).copy()  # type: ignore[union-attr]
+                starts[j][3] = typical[j]
+        return starts
+
+    def is_seen(end: _End, there: dict[int, FloatArray]) -> bool:
+        """Whether a fit shows the particle of a track, and no other one."""
+        theta = there[end.track]
+        nearest = min(
+            (_apart(theta, other) for k, other in there.items() if k != end.track), default=np.inf
+        )
+        alike = nearest > meeting_nm or theta[3] > LEAST_SHARE * typical[end.track]
+        step = _apart(theta, frames[end.frame][end.track])
+        return alike and nearest > same_nm and step < reach_nm
+
+    while ends:
+        proposed: dict[int, dict[int, _End]] = defaultdict(dict)
+        for end in ends:
+            t, here = end.frame + end.direction, frames[end.frame]
+            if not 0 <= t < field.frames or end.track in frames[t]:
+                continue
+            newborn = (theta for k, theta in frames[t].items() if k not in here)
+            taken = any(_apart(theta, here[end.track]) < same_nm for theta in newborn)
+            if field.holds(here[end.track]) and not taken:
+                proposed[t][end.track] = end
+        if not proposed:
+            break
+        starts = {t: with_neighbours(t, new) for t, new in proposed.items()}
+        fitted, done = field.refit(ground, _rows_of(starts, blur), sweeps=6)
+        good = done & (fitted.snr > LEAST_SNR)
+        ends = []
+        for t, new in proposed.items():
+            of_frame = fitted.frame == t
+            tracks = fitted.track[of_frame].tolist()
+            there = dict(zip(tracks, fitted.theta[of_frame], strict=True))
+            sure = dict(zip(tracks, good[of_frame].tolist(), strict=True))
+            accepted = [k for k, end in new.items() if sure[k] and is_seen(end, there)]
+            if accepted:
+                there = {k: v for k, v in there.items() if k in frames[t] or k in accepted}
+                frames[t].update(there)
+                refitted[t] = fitted.only(of_frame)
+                ends += [_End(k, t, new[k].direction) for k in accepted]
+        added += len(ends)
+    rows = replace(rows, group=blur[rows.track])
+    if not refitted:
+        return rows, 0
+    changed = _rows_of({t: frames[t] for t in refitted}, blur).recalling(rows)
+    changed = changed.recalling(Localizations.together([refitted[t] for t in sorted(refitted)]))
+    others = rows.only(~np.isin(rows.frame, changed.frame))
+    return Localizations.together([others, changed]).in_order(), added
+
+
+def _rows_of(frames: Mapping[int, Mapping[int, FloatArray]], blur: IntArray) -> Localizations:
+    """Make rows of parameters by frame and track."""
+    keys = np.array([(t, k) for t, there in frames.items() for k in there], dtype=np.int64)
+    theta = np.array([theta for there in frames.values() for theta in there.values()])
+    return Localizations.of(keys[:, 0], keys[:, 1], theta, blur[keys[:, 1]])
 
 
 OUTLYING = 5.0
@@ -199,15 +189,13 @@ _MEETING = 5  # frames before and after two were crowded, in which one of them m
 def linked(
     config: Config,
     rows: Localizations,
-    places: FloatArray,
     *,
     bridged: bool = False,
     inner: tuple[int, int] | None = None,
 ) -> Localizations:
-    """Link rows, drop tracks that are too short, and fill gaps; tracks are numbered in time order.
-
-    Shapes: `places` (n, axes).
-    """
+    """Link rows, drop tracks that are too short, and fill gaps; number tracks in time order."""
+    error = typical_error(rows.fisher) if len(rows.frame) else 1.0
+    places = with_mass(config, rows, error)
     if not np.isfinite(places).all():
         raise DataError(
             "the light under the particles cannot be told from them: it changes from frame to "
@@ -238,21 +226,11 @@ def _least(config: Config, rows: Localizations, inner: tuple[int, int] | None) -
     return least
 
 
-def mass_places(config: Config, rows: Localizations) -> FloatArray:
+def with_mass(config: Config, rows: Localizations, error: float) -> FloatArray:
     """Positions for linking: x, y, and the mass expressed as a length.
 
     A change of the mass by its own error counts as `_MASS_STEP_SHARE` of the largest step, so that
     particles of different mass keep their identities where they cross.
-
-    Shapes: result (n, 3).
-    """
-    if not len(rows.frame):
-        return rows.theta[:, :2]
-    return with_mass(config, rows, typical_error(rows.fisher))
-
-
-def with_mass(config: Config, rows: Localizations, error: float) -> FloatArray:
-    """Append the mass, as a length, to positions.
 
     Shapes: result (n, 3).
     """
@@ -278,10 +256,15 @@ def typical_error(fisher: FloatArray) -> float:
 def typical(rows: Localizations) -> Localizations:
     """Give every row the median amplitude of its track."""
     theta = rows.theta.copy()
-    for k in np.unique(rows.track):
-        mine = rows.track == k
-        theta[mine, 3] = np.median(theta[mine, 3])
+    theta[:, 3] = medians_of_tracks(rows.track, theta[:, 3])
     return replace(rows, theta=theta)
+
+
+def track_ends(rows: Localizations, which: int) -> Localizations:
+    """First (0) or last (−1) row of every track, with the median mass of the track."""
+    order = np.lexsort((rows.frame, rows.track))
+    edges = np.flatnonzero(np.diff(rows.track[order], prepend=-1, append=-1))
+    return typical(rows).only(order[edges[:-1] if which == 0 else edges[1:] - 1])
 
 
 def alone(
@@ -317,38 +300,22 @@ def extrapolated(
 ) -> tuple[Localizations, int]:
     """Add trial rows where slow particles were not detected, at their last and next positions."""
     reach = config.optics.wavelength_nm / config.optics.na
-    frame, track, theta, group = [], [], [], []
-    for k in np.unique(rows.track):
-        mine = np.flatnonzero(rows.track == k)
-        if _step_nm2(rows, mine) * _BRIDGE_FRAMES > reach**2:
-            continue
-        middle = float(np.median(rows.theta[mine, 3]))
-        for end, direction in ((mine[0], -1), (mine[-1], 1)):
-            first = int(rows.frame[end])
-            extrapolated = np.clip(
-                first + direction * np.arange(1, _BRIDGE_FRAMES + 1), 0, field.frames - 1
-            )
-            for t in np.unique(extrapolated[extrapolated != first]):
-                frame.append(int(t))
-                track.append(int(k))
-                theta.append(np.append(rows.theta[end, :3], [middle, 0.0]))
-                group.append(int(rows.group[end]))
-    if not frame:
-        return rows, 0
-    frames, tracks, groups = (np.array(v, dtype=np.int64) for v in (frame, track, group))
-    return rows.joined(frames, tracks, np.array(theta), groups), len(frame)
+    slow = _steps_nm2(rows) * _BRIDGE_FRAMES <= reach**2
+    longer = rows
+    for which, direction in ((0, -1), (-1, 1)):
+        end = track_ends(rows, which).only(slow)
+        frame = end.frame[:, None] + direction * np.arange(1, _BRIDGE_FRAMES + 1)
+        of, step = np.nonzero((frame >= 0) & (frame < field.frames))
+        longer = longer.joined(frame[of, step], end.track[of], end.theta[of], end.group[of])
+    return longer, len(longer.frame) - len(rows.frame)
 
 
 def trimmed(rows: Localizations) -> Localizations:
     """Cut frames with too little mass off both ends of tracks."""
-    keep = np.ones(len(rows.frame), dtype=bool)
-    for k in np.unique(rows.track):
-        mine = np.flatnonzero(rows.track == k)
-        amplitude = rows.theta[mine, 3]
-        full = np.flatnonzero(amplitude > LEAST_SHARE * np.median(amplitude))
-        if len(full):
-            keep[mine[: full[0]]] = keep[mine[full[-1] + 1 :]] = False
-    return rows.only(keep)
+    light = pd.Series(rows.theta[:, 3] > LEAST_SHARE * typical(rows).theta[:, 3])
+    begun = light.groupby(rows.track).cummax()
+    goes_on = light[::-1].groupby(rows.track[::-1]).cummax()[::-1]
+    return rows.only((begun & goes_on).to_numpy())
 
 
 def shares_mass(rows: Localizations, judged: Judged) -> BoolArray:
@@ -365,13 +332,9 @@ def has_other_mass(track: IntArray, mass: FloatArray, error: FloatArray) -> Bool
 
     Shapes: `track` (n,), `mass, error` (n,), result (n,).
     """
-    out = np.zeros(len(track), dtype=bool)
-    for k in np.unique(track):
-        mine = track == k
-        off = (mass[mine] - np.median(mass[mine])) / error[mine]
-        scale = max(1.0, float(np.median(np.abs(off))) / 0.6745)
-        out[mine] = np.abs(off) > OUTLYING * scale
-    return out
+    off = np.abs(mass - medians_of_tracks(track, mass)) / error
+    scale = np.maximum(SIGMA_PER_MAD * medians_of_tracks(track, off), 1.0)
+    return np.asarray(off > OUTLYING * scale)
 
 
 def crowded(rows: Localizations, limit_nm: float) -> BoolArray:
@@ -412,11 +375,9 @@ def bridge(config: Config, rows: Localizations) -> IntArray:
     Shapes: result (n,).
     """
     reach = config.optics.wavelength_nm / config.optics.na
-    tracks = [np.flatnonzero(rows.track == k) for k in np.unique(rows.track)]
-    last, first = (np.array([mine[end] for mine in tracks], dtype=np.int64) for end in (-1, 0))
-    square = np.array([_step_nm2(rows, mine) for mine in tracks])
-    gap = rows.frame[first] - rows.frame[last][:, None]
-    apart = scipy.spatial.distance.cdist(rows.theta[last, :2], rows.theta[first, :2])
+    first, last, square = track_ends(rows, 0), track_ends(rows, -1), _steps_nm2(rows)
+    gap = first.frame - last.frame[:, None]
+    apart = scipy.spatial.distance.cdist(last.theta[:, :2], first.theta[:, :2])
     may = (gap > 0) & (gap <= _BRIDGE_FRAMES + 1) & (apart < reach)
     may &= np.maximum(square, square[:, None]) * np.maximum(gap, 1) < reach**2
     if not may.any():
@@ -425,23 +386,32 @@ def bridge(config: Config, rows: Localizations) -> IntArray:
     track = rows.track.copy()
     for i, j in zip(before.tolist(), after.tolist(), strict=True):
         if may[i, j]:
-            track[track == track[first[j]]] = track[first[i]]
+            old, new = (int(np.argmax(rows.track == k)) for k in (first.track[j], first.track[i]))
+            track[track == track[old]] = track[new]
     return track
 
 
-def _step_nm2(rows: Localizations, mine: IntArray) -> float:
-    """Return the mean square of a track's steps from frame to frame, from its median."""
-    next_ = np.diff(rows.frame[mine]) == 1
-    steps = np.diff(rows.theta[mine, :2], axis=0)[next_]
-    return mean_square(steps) if len(steps) else np.inf
+def _steps(rows: Localizations) -> tuple[IntArray, FloatArray]:
+    """Give the steps (n, 2) from frame to frame within tracks, and their tracks (n,)."""
+    order = np.lexsort((rows.frame, rows.track))
+    track = rows.track[order]
+    next_ = (np.diff(track) == 0) & (np.diff(rows.frame[order]) == 1)
+    return track[1:][next_], np.diff(rows.theta[order, :2], axis=0)[next_]
+
+
+def _steps_nm2(rows: Localizations) -> FloatArray:
+    """Mean square of the steps of each track from frame to frame; infinite where it has none."""
+    track, steps = _steps(rows)
+    squares = pd.Series((steps**2).sum(axis=1)).groupby(track).median() / math.log(2)
+    return squares.reindex(np.unique(rows.track), fill_value=np.inf).to_numpy(float)
 
 
 def mean_square(steps: FloatArray) -> float:
-    """Mean square of normal steps from their median, which is robust against outliers.
+    """Mean square of normal steps from their median, which is robust against outliers; 0 of none.
 
     Shapes: `steps` (n, 2).
     """
-    return float(np.median((steps**2).sum(axis=1)) / np.log(2))
+    return float(np.median((steps**2).sum(axis=1)) / math.log(2)) if len(steps) else 0.0
 
 
 def numbered(rows: Localizations) -> Localizations:
@@ -467,22 +437,21 @@ _APART_FRAMES = 5  # in which two must be apart before they meet again
 
 def identified(rows: Localizations, *, near_nm: float, error: float) -> Localizations:
     """Exchange what comes after meetings between tracks where that is far more likely."""
-    track = rows.track.copy()
-    typical = _Typical.of(rows, near_nm, error)
+    track, typical = rows.track.copy(), _Typical.of(rows, near_nm, error)
     meetings = _meetings(rows, near_nm)
-    number = np.repeat(np.arange(len(meetings)), [len(met.rows) for met in meetings])
-    met_rows = np.concatenate([track[:0], *(met.rows for met in meetings)])
+    latest = np.full(len(track), -1)  # meeting of each row
     for k, met in enumerate(meetings):
-        later = met_rows[number > k]
+        latest[met.rows] = k
+    for k, met in enumerate(meetings):
         labels = np.unique(track[met.rows])
-        sides = [
-            _track_side(rows, track, int(one), met, later, typical) for one in labels if one >= 0
-        ]
+        later = latest > k
+        sides = [_track_side(rows, track, one, met, later, typical) for one in labels[labels >= 0]]
         for path in _chains(sides, typical):
             _continue_chain(rows, track, path, met)
-    kept = track >= 0
-    group = _groups(rows, track)
-    return Localizations.of(rows.frame[kept], track[kept], rows.theta[kept], group[kept])
+    group = rows.group.copy()
+    for one in np.unique(track[track != rows.track]):  # the blur that most rows of it have
+        group[track == one] = np.bincount(rows.group[track == one]).argmax()
+    return replace(rows, track=track, group=group).only(track >= 0).in_order()
 
 
 @dataclass(frozen=True)
@@ -510,10 +479,8 @@ class _Typical:
     @classmethod
     def of(cls, rows: Localizations, near_nm: float, error: float) -> _Typical:
         """Estimate it from all rows."""
-        order = np.lexsort((rows.frame, rows.track))
-        next_ = (np.diff(rows.track[order]) == 0) & (np.diff(rows.frame[order]) == 1)
-        step = _variance_nm2(np.diff(rows.theta[order, :2], axis=0)[next_])
-        mass = rows.theta[:, 3] if len(order) else np.zeros(1)
+        step = mean_square(_steps(rows)[1]) / 2
+        mass = rows.theta[:, 3] if len(rows.frame) else np.zeros(1)
         least = (1e-3 * near_nm) ** 2  # of what does not move at all
         return cls(max(step, least), float(np.median(mass)), float(mass.var()), near_nm, error)
 
@@ -527,7 +494,7 @@ class _Typical:
         mass = float(np.median(theta[:, 3]))
         # neighbours change all frames of a part by 2 % alike
         variance = math.pi / 2 * self.error**2 / len(mine) + (0.02 * mass) ** 2
-        square = steps * _variance_nm2(moved)
+        square = steps * mean_square(moved) / 2
         return _Part(steps, square, mass, variance, frame[[0, -1]], theta[[0, -1], :2])
 
     def evidence(self, before: _Part | None, after: _Part | None) -> float:
@@ -556,11 +523,6 @@ class _Typical:
         """Log-likelihood of steps whatever their variance, but for (2π)^−N."""
         prior = math.log(self.step_nm2)
         return math.lgamma(steps + 1) + prior - (steps + 1) * math.log(self.step_nm2 + square)
-
-
-def _variance_nm2(moved: FloatArray) -> float:
-    """Variance of steps along an axis; 0 of none."""
-    return mean_square(moved) / 2 if len(moved) else 0.0
 
 
 def _normal(off: float, variance: float) -> float:
@@ -593,15 +555,14 @@ def _track_side(
     track: IntArray,
     one: int,
     met: _Meeting,
-    later: IntArray,
+    later: BoolArray,
     typical: _Typical,
 ) -> _Side:
     """Summarise one track of a meeting; `later` are the rows of the meetings that follow."""
     mine = np.flatnonzero(track == one)
     frame = rows.frame[mine]
     first, last = rows.frame[met.rows[track[met.rows] == one]][[0, -1]].tolist()
-    coming = rows.frame[later[track[later] == one]]
-    until = coming[coming > last].min(initial=int(frame[-1]) + 1)
+    until = frame[later[mine] & (frame > last)].min(initial=int(frame[-1]) + 1)
     before = typical.part(rows, mine[frame < first])
     after = typical.part(rows, mine[(frame > last) & (frame < until)])
     begins, ends = first - frame[0] <= _APART_FRAMES, frame[-1] - last <= _APART_FRAMES
@@ -667,13 +628,14 @@ class _Pair(NamedTuple):
 
     first: int
     last: int
-    tracks: tuple[int, int]
+    one: int
+    other: int
     rows: IntArray
 
 
 def _meetings(rows: Localizations, near_nm: float) -> list[_Meeting]:
     """Join close pairs into meetings, sorted by frame."""
-    pairs = sorted(_pairs(rows, near_nm))
+    pairs = _pairs(rows, near_nm)
     number = np.arange(len(pairs))
     for one, two in _of_one(rows, pairs):
         number[number == number[two]] = number[one]
@@ -691,25 +653,27 @@ def _of_one(rows: Localizations, pairs: list[_Pair]) -> Iterator[tuple[int, int]
     Two pairs do if they share a track, at once or shortly after one another.  A track that ends
     close to another one is taken to be merged with it until a new track begins close to that one.
     """
-    numbers, firsts = np.unique(rows.track, return_index=True)
-    begins = dict(zip(numbers.tolist(), rows.frame[firsts].tolist(), strict=True))
-    ends = dict(zip(rows.track.tolist(), rows.frame.tolist(), strict=True))  # the last one stays
+    frames = pd.Series(rows.frame).groupby(rows.track)
+    begins, ends = frames.first(), frames.last()
+    sides = [
+        (k, pair, one, other)
+        for k, pair in enumerate(pairs)
+        for one, other in ((pair.one, pair.other), (pair.other, pair.one))
+    ]
     born: dict[int, list[tuple[int, int]]] = defaultdict(list)
     spans: dict[int, list[tuple[int, int, int]]] = defaultdict(list)
-    for k, pair in enumerate(pairs):
-        for one, other in (pair.tracks, pair.tracks[::-1]):
-            if pair.first - begins[other] <= _APART_FRAMES:
-                born[one].append((pair.first, k))
-    for k, pair in enumerate(pairs):
+    for k, pair, one, other in sides:
+        if pair.first - begins[other] <= _APART_FRAMES:
+            born[one].append((pair.first, k))
+    for k, pair, one, other in sides:
         brief = pair.last - pair.first <= 300  # others meet lasting neighbours one by one
-        for one, other in (pair.tracks, pair.tracks[::-1]):
-            until = pair.last
-            if ends[other] - pair.last <= _APART_FRAMES:
-                soon = (b for b in born[one] if 0 < b[0] - pair.last <= MERGED_FRAMES)
-                until, parted = next(soon, (until, k))
-                yield k, parted
-            if brief or until > pair.last:
-                spans[one].append((pair.first if brief else pair.last, until, k))
+        until = pair.last
+        if ends[other] - pair.last <= _APART_FRAMES:
+            soon = (b for b in born[one] if 0 < b[0] - pair.last <= MERGED_FRAMES)
+            until, parted = next(soon, (until, k))
+            yield k, parted
+        if brief or until > pair.last:
+            spans[one].append((pair.first if brief else pair.last, until, k))
     for of_track in spans.values():
         reach, held = -math.inf, -1
         for first, last, k in sorted(of_track):
@@ -718,29 +682,17 @@ def _of_one(rows: Localizations, pairs: list[_Pair]) -> Iterator[tuple[int, int]
             reach, held = max(reach, last), k
 
 
-def _pairs(rows: Localizations, near_nm: float) -> Iterator[_Pair]:
-    """Find the times during which two tracks are closer than `near_nm`."""
-    one, two = rows.pairs_within(near_nm).T
-    swapped = rows.track[one] > rows.track[two]
-    one, two = np.where(swapped, two, one), np.where(swapped, one, two)
-    order = np.lexsort((rows.frame[one], rows.track[two], rows.track[one]))
-    one, two = one[order], two[order]
-    frame, tracks = rows.frame[one], np.stack([rows.track[one], rows.track[two]], axis=1)
+def _pairs(rows: Localizations, near_nm: float) -> list[_Pair]:
+    """Find the times during which two tracks are closer than `near_nm`, in the order of time."""
+    both = rows.pairs_within(near_nm)
+    both = np.take_along_axis(both, np.argsort(rows.track[both], axis=1), axis=1)
+    frame, tracks = rows.frame[both[:, 0]], rows.track[both]
+    order = np.lexsort((frame, *tracks.T))
+    both, frame, tracks = both[order], frame[order], tracks[order]
     others = (np.diff(tracks, axis=0) != 0).any(axis=1) | (np.diff(frame) > _APART_FRAMES)
-    for run in np.split(np.arange(len(one)), np.flatnonzero(others) + 1):
-        if run.size:
-            first, last = frame[run[[0, -1]]].tolist()
-            of = int(tracks[run[0], 0]), int(tracks[run[0], 1])
-            yield _Pair(first, last, of, np.stack([one[run], two[run]], axis=1))
-
-
-def _groups(rows: Localizations, track: IntArray) -> IntArray:
-    """Give each row the blur that most rows of its new track have."""
-    group = rows.group.copy()
-    for k in np.unique(track[track != rows.track]):
-        mine = track == k
-        group[mine] = np.bincount(rows.group[mine]).argmax()
-    return group
+    runs = np.split(np.arange(len(both)), np.flatnonzero(others) + 1) if len(both) else []
+    spans = [(int(frame[run[0]]), int(frame[run[-1]]), *tracks[run[0]].tolist()) for run in runs]
+    return sorted(_Pair(*span, both[run]) for span, run in zip(spans, runs, strict=True))
 
 
 def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int) -> IntArray:

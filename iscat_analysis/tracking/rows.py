@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
+import pandas as pd
 import scipy
 from numpy.typing import NDArray
 
@@ -97,6 +98,14 @@ class Localizations:
         places = np.column_stack([self.theta[:, :2], apart])
         tree = scipy.spatial.cKDTree(places, balanced_tree=False, compact_nodes=False)
         return np.asarray(tree.query_pairs(limit_nm, output_type="ndarray"), dtype=np.int64)
+
+
+def medians_of_tracks(track: IntArray, values: FloatArray) -> FloatArray:
+    """Give every row the median of the values of its track.
+
+    Shapes: `track` (n,), `values` (n,), result (n,).
+    """
+    return pd.Series(values).groupby(track).transform("median").to_numpy(float)
 
 
 @dataclass(frozen=True)

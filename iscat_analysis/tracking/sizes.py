@@ -40,7 +40,7 @@ from iscat_analysis.species.diffusion import (
 )
 from iscat_analysis.species.tracks import SLOWED_BY_WALL, Correlation
 from iscat_analysis.tracking.frames import exposure_of
-from iscat_analysis.tracking.table import ALONG, path_shifts_at
+from iscat_analysis.tracking.table import ALONG, path_shifts
 
 LEAST_ABSORPTION = 1e-6
 """Imaginary part of an index from which a single index does not describe the material."""
@@ -111,9 +111,9 @@ def sphere_track(
     if variance > 0:
         z = np.array([event.fit.z_nm for event in fitted])
         place = averaged, context.roi_px, context.pixel_nm
-        moved = path_shifts_at(*place, z, start_kda, variance)
+        moved = path_shifts(*place, z, start_kda, variance)
         fitted = [_with_path(event, one) for event, one in zip(fitted, moved, strict=True)]
-        of_used = path_shifts_at(*place, sizes[0].places[:, 2], start_kda, variance)[:, 3]
+        of_used = path_shifts(*place, sizes[0].places[:, 2], start_kda, variance)[:, 3]
         wider = of_used[:, :3].sum(axis=1) / ALONG * (sigma_d / d_um2_s)
         shifts = np.column_stack([of_used, wider])
     configured = homogeneous = None

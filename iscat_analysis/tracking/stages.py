@@ -12,6 +12,8 @@ that of the steps that it implies, is the largest (A. J. Viterbi, IEEE Trans. In
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,7 +27,7 @@ from iscat_analysis.optics.model import path_variance_nm2
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.species.diffusion import estimate_diffusion
 from iscat_analysis.threads import start_in_thread
-from iscat_analysis.tracking.field import MovingField
+from iscat_analysis.tracking.field import BLOCK, MovingField
 from iscat_analysis.tracking.frames import (
     Recording,
     exposure_of,
@@ -51,7 +53,6 @@ from iscat_analysis.tracking.linking import (
     linked,
     load_linker,
     mass_error,
-    mass_places,
     mean_square,
     meeting,
     numbered,
@@ -66,8 +67,6 @@ from iscat_analysis.tracking.search import FrameCandidates, search_frames
 
 IntArray = NDArray[np.int64]
 
-_BLOCK = 64  # frames at a time
-
 
 def decide_heights(
     field: MovingField,
@@ -80,32 +79,24 @@ def decide_heights(
     """Choose the interference fringe of every row by the likelihood of its whole track."""
     if not len(rows.frame):
         return rows
-    starts = rows.starts(field.frames)
-    rank = np.arange(len(rows.frame)) - starts[rows.frame]
-    ladders = []
+    rank = np.arange(len(rows.frame)) - rows.starts(field.frames)[rows.frame]
+    rungs = 2 * math.ceil(np.ptp(z_range_nm) / fringe_nm) + 5
+    candidates = np.repeat(rows.theta[:, None], rungs, axis=1)
+    values = np.full((len(rows.frame), rungs), -np.inf)
     for turn in range(int(rank.max()) + 1):  # one particle of each frame climbs at a time
-        ladders.append(_ladder(field, ground, rows, rank == turn, fringe_nm, z_range_nm))
-    steps = max(candidates.shape[1] for candidates, _ in ladders)
-    candidates = np.repeat(rows.theta[:, None], steps, axis=1)
-    values = np.full((len(rows.frame), steps), -np.inf)
-    for turn, (heights, gains) in enumerate(ladders):
-        candidates[rank == turn, : heights.shape[1]] = heights
-        values[rank == turn, : gains.shape[1]] = gains
+        mine = rank == turn
+        ladder = _ladder(field, ground, rows, mine, fringe_nm, z_range_nm)
+        for rung, (fitted, gain) in enumerate(ladder):
+            candidates[mine, rung], values[mine, rung] = fitted, gain
     # Where no fit converged, the other rows of the track decide.
     values[~np.isfinite(values).any(axis=1)] = 0.0
-    out = rows.theta.copy()
-    single = np.flatnonzero(rows.track < 0)
-    out[single] = candidates[single, values[single].argmax(axis=1)]
+    out = candidates[np.arange(len(rank)), values.argmax(axis=1)]
     for k in np.unique(rows.track[rows.track >= 0]):
         mine = np.flatnonzero(rows.track == k)
-        steps = np.diff(rows.theta[mine, :2], axis=0)
         apart = np.diff(rows.frame[mine])
-        square = (steps**2).mean(axis=1) / apart
-        per_frame = max(
-            float(np.median(square)) / 0.6931 if len(square) else 0.0,
-            # no particle is taken to move by less than 0.05 fringes between two frames
-            (0.05 * fringe_nm) ** 2,
-        )
+        step = np.diff(rows.theta[mine, :2], axis=0) / np.sqrt(2 * apart)[:, None]
+        # no particle is taken to move by less than 0.05 fringes between two frames
+        per_frame = max(mean_square(step), (0.05 * fringe_nm) ** 2)
         path = _best_path(candidates[mine, :, 2], values[mine], per_frame * apart)
         out[mine] = candidates[mine, path]
     return replace(rows, theta=out)
@@ -118,22 +109,17 @@ def _ladder(
     climbs: BoolArray,
     fringe_nm: float,
     z_range_nm: tuple[float, float],
-) -> tuple[FloatArray, FloatArray]:
+) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Fit some rows in every fringe, each fit starting from the one in the fringe before.
 
-    The other rows of their frames stay as they are.  Returns the fits, shape (n, rungs, 5), and
-    their log-likelihoods, (n, rungs).
-
-    Returns what was fitted, shape (n, rungs, 5), and its log-likelihood, (n, rungs).
+    The other rows of their frames stay as they are.  Yields what was fitted, shape (n, 5), and its
+    log-likelihood, (n,).
     """
     low, high = z_range_nm
-    frames = np.zeros(field.frames, dtype=bool)
-    frames[rows.frame[climbs]] = True
-    with_others = frames[rows.frame]
+    with_others = np.isin(rows.frame, rows.frame[climbs])
     rows, mine = rows.only(with_others), climbs[with_others]
     usual = typical(rows).theta[:, 3]
-    gain = _values(field, ground, rows)
-    thetas, gains = [rows.theta[mine]], [gain[mine]]
+    yield rows.theta[mine], _values(field, ground, rows)[mine]
     for direction in (1, -1):
         here = rows.theta.copy()
         # A fit that has reached zero mass in a wrong fringe would stay there.
@@ -146,12 +132,10 @@ def _ladder(
             start = np.where(inside[:, None], here, rows.theta)
             start[:, 2] = np.clip(start[:, 2], low, high)
             fitted, _, done = field.fit(ground, replace(rows, theta=start), sweeps=1)
-            gain = _values(field, ground, fitted)
-            thetas.append(fitted.theta[mine])
-            gains.append(np.where(inside & done, gain, -np.inf)[mine])
+            gain = np.where(inside & done, _values(field, ground, fitted), -np.inf)
+            yield fitted.theta[mine], gain[mine]
             stayed = inside & (np.abs(fitted.theta[:, 2] - start[:, 2]) < fringe_nm / 2)
             here[stayed, 2] = fitted.theta[stayed, 2]
-    return np.stack(thetas, axis=1), np.stack(gains, axis=1)
 
 
 def _values(field: MovingField, ground: BackgroundEstimate, rows: Localizations) -> FloatArray:
@@ -162,8 +146,8 @@ def _values(field: MovingField, ground: BackgroundEstimate, rows: Localizations)
     """
     out = np.zeros(field.frames)
     field.draw(ground, rows)
-    for first in range(0, field.frames, _BLOCK):
-        last = min(first + _BLOCK, field.frames)
+    for first in range(0, field.frames, BLOCK):
+        last = min(first + BLOCK, field.frames)
         left = field.residual(ground, rows, first, last)
         noise = ground.power[first:last, None, None] * ground.level + field.read_e2
         out[first:last] = -np.einsum("tyx,tyx->t", left, left / noise) / 2
@@ -237,26 +221,30 @@ class Task:
 
     def linked(self, rows: Localizations, *, bridged: bool = False) -> Localizations:
         """Link rows by their places and masses."""
-        places = mass_places(self.config, rows)
-        return linked(self.config, rows, places, bridged=bridged, inner=self.inner)
+        return linked(self.config, rows, bridged=bridged, inner=self.inner)
 
     def fitted(self, state: State, turns: int = MOST_TURNS, *, coarse: bool = True) -> State:
         """Fit rows and background in turn."""
+        ways = self.config.background
         rows, ground, done = fit_jointly(
-            self.field, state.ground, state.rows, turns=turns, coarse=coarse,
-            follow_power=self.config.background.power_normalization,
-            follow_level=self.learns_background,
-        )  # fmt: skip
+            self.field,
+            state.ground,
+            state.rows,
+            turns=turns,
+            coarse=coarse,
+            follow_power=ways.power_normalization,
+            follow_level=ways.learnt_with_tracks,
+        )
         return replace(state, rows=rows, ground=ground, done=done)
 
     def in_fringes(self, state: State) -> State:
         """Choose the interference fringe of every row by its track, where heights are free."""
         if not self.heights_free:
             return state
+        fringe_nm, z_range_nm = self.context.model.fringe_nm, self.config.fit.z_range_nm
         rows = decide_heights(
-            self.field, state.ground, state.rows,
-            fringe_nm=self.context.model.fringe_nm, z_range_nm=self.config.fit.z_range_nm,
-        )  # fmt: skip
+            self.field, state.ground, state.rows, fringe_nm=fringe_nm, z_range_nm=z_range_nm
+        )
         return replace(state, rows=rows)
 
     def blurred(self, state: State) -> State:
@@ -279,16 +267,11 @@ class State:
 
 
 @dataclass(frozen=True)
-class TrackedRows:
+class TrackedRows(State):
     """All that was found in a movie of moving particles."""
 
-    rows: Localizations
-    ground: BackgroundEstimate
     judged: Judged
-    converged: BoolArray
     close: BoolArray
-    variances_nm2: FloatArray
-    diffusion: FloatArray
     field: MovingField
     shared: FloatArray
     common: CommonAmplitudes
@@ -304,9 +287,14 @@ def search(task: Task, state: State) -> State:
     for number in range(ROUNDS):
         before = len(state.rows.frame)
         found = search_frames(
-            task.context, task.field, state.ground, state.rows, task.recording.pool,
-            enough=round(_FEW * before) if number >= _FULL else 0, cautious=task.cautious,
-        )  # fmt: skip
+            task.context,
+            task.field,
+            state.ground,
+            state.rows,
+            task.recording.pool,
+            enough=round(_FEW * before) if number >= _FULL else 0,
+            cautious=task.cautious,
+        )
         if number and len(found.frame) <= _FEW * before:
             break
         rows = _joined(task.context, state.rows, found)
@@ -336,10 +324,10 @@ def extend(task: Task, state: State) -> State:
         state = task.fitted(state, _NEXT_TURNS if number else 1)
         rows, added = trimmed(state.rows), 0
         if not task.cautious:
+            reach_nm, near_nm = task.config.track.max_step_nm, task.resolution_nm
             rows, added = extended(
-                task.field, state.ground, rows,
-                resolution_nm=task.resolution_nm, reach_nm=task.config.track.max_step_nm,
-            )  # fmt: skip
+                task.field, state.ground, rows, resolution_nm=near_nm, reach_nm=reach_nm
+            )
         rows = alone(task.context, task.linked(rows, bridged=True), inner=task.inner)
         # in two rounds slow particles are tried where they were not detected
         ground, trial = state.ground, number < 2
@@ -410,11 +398,9 @@ def find_rows_and_background(
     field, progress = load_field(context, recording, span), recording.progress
     task = Task(context, recording, span[0], field, inner, cautious)
     nothing = np.zeros(0, dtype=np.int64)
-    state = State(
-        rows=Localizations.of(nothing, nothing, np.zeros((0, 5))),
-        ground=initial_background(context.config, field),
-        done=np.zeros(0, dtype=np.bool_), variances_nm2=np.zeros(1), diffusion=np.zeros((0, 2)),
-    )  # fmt: skip
+    rows = Localizations.of(nothing, nothing, np.zeros((0, 5)))
+    ground = initial_background(context.config, field)
+    state = State(rows, ground, np.zeros(0, dtype=np.bool_), np.zeros(1), np.zeros((0, 2)))
     for number, stage in enumerate(STAGES):
         progress("track", number, len(STAGES) + 1)
         state = stage(task, state)
@@ -428,18 +414,14 @@ def _judged(task: Task, state: State) -> TrackedRows:
     """Compute what the likelihood says of each row and of each track."""
     field, ground, rows = task.field, state.ground, state.rows
     judged = field.judge(ground, rows)
-    shared = shared_errors(field, ground, rows, judged)
     near = meeting(rows, task.config.detection.min_separation_nm)
-    unlike = shares_mass(rows, judged)
-    close = near | unlike
+    unlike = shared_mass = shares_mass(rows, judged)
     if task.heights_free:  # a path along z takes as much of the mass, and must count
-        unlike = unlike & crowded(rows, task.context.roi_px * task.context.pixel_nm)
+        unlike = shared_mass & crowded(rows, task.context.roi_px * task.context.pixel_nm)
     counted = state.done & field.holds(rows.theta) & ~near & ~unlike
     common = common_amplitudes(field, ground, rows, judged, counted)
-    return TrackedRows(
-        rows, ground, judged, state.done, close, state.variances_nm2, state.diffusion, field,
-        shared, common,
-    )  # fmt: skip
+    found = {"judged": judged, "close": near | shared_mass, "field": field, "common": common}
+    return TrackedRows(**vars(state), **found, shared=shared_errors(field, ground, rows, judged))
 
 
 def _refuse_flood(task: Task, rows: Localizations) -> None:
@@ -474,16 +456,10 @@ def _credible(task: Task, rows: Localizations, done: BoolArray) -> Localizations
     known = np.asarray(np.isfinite(rows.theta).all(axis=1), dtype=np.bool_)
     rows, done = rows.only(known), done[known]
     kept = done & (rows.theta[:, 3] > 0) & (rows.snr > AS_FOUND * task.context.templates.threshold)
-    near = task.resolution_nm / 4
-    starts = rows.starts(task.field.frames)
-    for t in np.unique(rows.frame[crowded(rows, near)]):
-        order = starts[t] + np.argsort(-rows.snr[starts[t] : starts[t + 1]])
-        for i, a in enumerate(order):
-            for b in order[:i]:
-                apart = np.hypot(*(rows.theta[a, :2] - rows.theta[b, :2]))
-                if kept[a] and kept[b] and apart < near:
-                    kept[a] = False
-    return rows.only(kept)
+    rows = rows.only(kept)
+    pairs = rows.pairs_within(task.resolution_nm / 4)
+    fainter = np.argmin(rows.snr[pairs], axis=1)[:, None]
+    return rows.only(~np.isin(np.arange(len(rows.frame)), np.take_along_axis(pairs, fainter, 1)))
 
 
 def diffusion_of(config: Config, free: BoolArray, rows: Localizations) -> FloatArray:
@@ -493,27 +469,18 @@ def diffusion_of(config: Config, free: BoolArray, rows: Localizations) -> FloatA
 
     Shapes: `free` (5,), result (tracks, 2).
     """
-    tracks = int(rows.track.max(initial=-1)) + 1
-    out = np.zeros((tracks, 2))
-    sigma = np.sqrt(variances_left(rows.fisher, np.flatnonzero(free[:4])))
-    axes = [0, 1]
-    rate, exposure = exposure_of(config)
+    out = np.zeros((int(rows.track.max(initial=-1)) + 1, 2))
+    sigma = np.sqrt(variances_left(rows.fisher, np.flatnonzero(free[:4])))[:, :2]
+    error, (rate, exposure) = sigma.max(axis=1), exposure_of(config)
     apart = ~meeting(rows, config.detection.min_separation_nm)
-    for k in range(tracks):
+    for k in range(len(out)):
         mine = apart & (rows.track == k)
-        error = sigma[:, axes].max(axis=1)
         if mine.any():
             # a place with 300 times the median error of its track tells nothing
             mine &= error < 300.0 * np.nanmedian(error[mine])
-        if mine.sum() < 4:
-            continue
-        out[k] = estimate_diffusion(
-            rows.frame[mine],
-            rows.theta[mine][:, axes],
-            sigma[mine][:, axes],
-            frame_rate_hz=rate,
-            exposure_ms=1e3 * exposure,
-        )
+        if mine.sum() >= 4:
+            places = rows.frame[mine], rows.theta[mine, :2], sigma[mine]
+            out[k] = estimate_diffusion(*places, frame_rate_hz=rate, exposure_ms=1e3 * exposure)
     return out
 
 
@@ -540,16 +507,16 @@ def without_outliers(rows: Localizations) -> Localizations:
     # In single frames the best place of a particle may be beside it: on its ring, or where another
     # was while the background was still wrong.  Such a row says that the particle was not where the
     # background of all other frames has it, so that the mass of one that hardly moves hangs on it.
-    theta = rows.theta.copy()
+    theta, mass = rows.theta.copy(), typical(rows).theta[:, 3]
     for k in np.unique(rows.track):
         mine = np.flatnonzero(rows.track == k)
         if len(mine) < _AROUND:
             continue
-        positions = theta[mine, :2]
-        usual = median_filter(positions, size=(_AROUND, 1), mode="nearest")
-        distance_squared = ((positions - usual) ** 2).sum(axis=1)
+        places = theta[mine, :2]
+        usual = median_filter(places, size=(_AROUND, 1), mode="nearest")
+        away = places - usual
         # of normal errors 1 in 10¹¹ is larger than 5 root mean squares
-        outliers = distance_squared > 5.0**2 * mean_square(positions - usual)
+        outliers = (away**2).sum(axis=1) > 5.0**2 * mean_square(away)
         theta[mine[outliers], :2] = usual[outliers]
-        theta[mine[outliers], 3] = np.median(theta[mine, 3])
+        theta[mine[outliers], 3] = mass[mine[outliers]]
     return replace(rows, theta=theta)

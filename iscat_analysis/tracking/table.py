@@ -11,8 +11,6 @@ interference turns so fast that this limits bright particles, and no frame tells
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -44,114 +42,50 @@ SKEW, SKEW_ACROSS = math.sqrt(0.90), math.sqrt(0.241)
 _STEP_NM = 2.0  # along z, of differences
 
 
-def path_covariances(context: AnalysisContext, moving: TrackedRows) -> FloatArray:
-    """Give the errors of rows that the unknown paths of their exposures make.
-
-    Shapes: result (n, 4, 4).
-    """
-    rows = moving.rows
-    out = np.zeros((len(rows.frame), 4, 4))
-    level = np.maximum(moving.judged.level, 1.0)
-    for number in np.unique(rows.group):
-        q = float(moving.variances_nm2[number])
-        mine = np.flatnonzero(rows.group == number)
-        if q == 0 or not mine.size:
-            continue
-        model = blurred(context.model, q, upwards=True)
-        covariance = partial(
-            path_covariance, model, context.roi_px, context.pixel_nm,
-            amplitude=float(np.median(rows.theta[mine, 3])), variance_nm2=q,
-            read_share=float(np.median(moving.field.read_e2) / np.median(level)),
-        )  # fmt: skip
-        out[mine] = _interpolated(covariance, model, rows.theta[mine, 2])
-    return out
-
-
-def path_shifts_at(
+def path_shifts(
     model: ForwardModel,
     roi_px: int,
     pixel_nm: float,
     z_nm: FloatArray,
     amplitude: float,
     variance_nm2: float,
+    read_share: float = 0.0,
 ) -> FloatArray:
-    """Give `path_shifts` at many heights.
+    """Shift of fits by each standard deviation of the unknown paths of their exposures.
+
+    The first three are of the variances of a path along x, y and z.
 
     Shapes: `z_nm` (n,), result (n, 4, 9).
     """
-    shifts = partial(
-        path_shifts, model, roi_px, pixel_nm, amplitude=amplitude, variance_nm2=variance_nm2
-    )
-    return _interpolated(shifts, model, z_nm)
+    grid, q = PixelGrid.centred(roi_px | 1, pixel_nm), variance_nm2
 
+    def at(z: float) -> FloatArray:
+        signal, slopes, second = model.amplitude_hessian(grid, 0.0, 0.0, z, amplitude)
+        low, high = (
+            model.amplitude_hessian(grid, 0.0, 0.0, z + step, amplitude)[2]
+            for step in (-_STEP_NM, _STEP_NM)
+        )
+        third = (high - low) / (2 * _STEP_NM)  # ∂z of ∂a∂b
+        skew = q**1.5
+        changes = np.stack(
+            [
+                *(ALONG * q / 2 * second[a, a] for a in range(3)),
+                *(ACROSS * q * second[a, b] for a, b in ((0, 1), (0, 2), (1, 2))),
+                SKEW * skew / 6 * third[2, 2],
+                *(SKEW_ACROSS * skew / 2 * third[a, 2] for a in (0, 1)),
+            ]
+        )
+        weight = 1 / (1 + signal + read_share)
+        fisher = np.einsum("ayx,byx,yx->ab", slopes, slopes, weight)
+        scale = 1 / np.sqrt(np.diag(fisher))
+        pulls = np.einsum("ayx,kyx,yx->ak", slopes, changes, weight) * scale[:, None]
+        return np.asarray(np.linalg.solve(fisher * np.outer(scale, scale), pulls) * scale[:, None])
 
-def _interpolated(
-    errors: Callable[[float], FloatArray], model: ForwardModel, z_nm: FloatArray
-) -> FloatArray:
-    """Compute errors at some heights, and interpolate linearly between them.
-
-    Shapes: `z_nm` (n,), result (n, …).
-    """
     # 8 heights in a fringe, linear in between
     count = max(2, math.ceil(np.ptp(z_nm) / model.fringe_nm * 8) + 1)
     heights = np.linspace(z_nm.min(), max(z_nm.max(), z_nm.min() + _STEP_NM), count)
-    table = np.stack([errors(height) for height in heights.tolist()])
+    table = np.stack([at(z) for z in heights.tolist()])
     return np.asarray(scipy.interpolate.make_interp_spline(heights, table, k=1)(z_nm))
-
-
-def path_covariance(
-    model: ForwardModel,
-    roi_px: int,
-    pixel_nm: float,
-    z_nm: float,
-    amplitude: float,
-    variance_nm2: float,
-    read_share: float = 0.0,
-) -> FloatArray:
-    """Covariance of one fit that the unknown path of its exposure makes.
-
-    Shapes: result (4, 4).
-    """
-    moved = path_shifts(model, roi_px, pixel_nm, z_nm, amplitude, variance_nm2, read_share)
-    return np.asarray(moved @ moved.T)
-
-
-def path_shifts(
-    model: ForwardModel,
-    roi_px: int,
-    pixel_nm: float,
-    z_nm: float,
-    amplitude: float,
-    variance_nm2: float,
-    read_share: float = 0.0,
-) -> FloatArray:
-    """Shift of one fit by each standard deviation of the unknown path of its exposure.
-
-    The first three are of its variances along x, y and z.
-
-    Shapes: result (4, 9).
-    """
-    grid, q = PixelGrid.centred(roi_px | 1, pixel_nm), variance_nm2
-    signal, slopes, second = model.amplitude_hessian(grid, 0.0, 0.0, z_nm, amplitude)
-    low, high = (
-        model.amplitude_hessian(grid, 0.0, 0.0, z_nm + step, amplitude)[2]
-        for step in (-_STEP_NM, _STEP_NM)
-    )
-    third = (high - low) / (2 * _STEP_NM)  # ∂z of ∂a∂b
-    skew = q**1.5
-    changes = np.stack(
-        [
-            *(ALONG * q / 2 * second[a, a] for a in range(3)),
-            *(ACROSS * q * second[a, b] for a, b in ((0, 1), (0, 2), (1, 2))),
-            SKEW * skew / 6 * third[2, 2],
-            *(SKEW_ACROSS * skew / 2 * third[a, 2] for a in (0, 1)),
-        ]
-    )
-    weight = 1 / (1 + signal + read_share)
-    fisher = np.einsum("ayx,byx,yx->ab", slopes, slopes, weight)
-    scale = 1 / np.sqrt(np.diag(fisher))
-    pulls = np.einsum("ayx,kyx,yx->ak", slopes, changes, weight) * scale[:, None]
-    return np.asarray(np.linalg.solve(fisher * np.outer(scale, scale), pulls) * scale[:, None])
 
 
 LARGEST_LOSS = 0.2
@@ -174,8 +108,8 @@ def moving_table(context: AnalysisContext, moving: TrackedRows, first_frame: int
     rows, judged, field = moving.rows, moving.judged, moving.field
     model, pixel, free = context.model, context.pixel_nm, moving.field.free[:4]
     index = np.flatnonzero(free)
-    n, amplitude = len(rows.frame), rows.theta[:, 3]
-    slope = np.abs(model.scale.slopes(amplitude))
+    n = len(rows.frame)
+    slope = np.abs(model.scale.slopes(rows.theta[:, 3]))
     units = np.column_stack([np.ones((n, 3)), slope])
     sigma = np.sqrt(variances_left(judged.observed, index)) * units
     crb = np.sqrt(variances_left(judged.fisher, index)) * units
@@ -184,24 +118,22 @@ def moving_table(context: AnalysisContext, moving: TrackedRows, first_frame: int
     estimate = rows.theta[:, :4] - judged.bias * shift[:, None]
     mass = model.scale.mass(estimate[:, 3])
     losses = losses_to_blur(context, moving)[rows.group]
-    path = _path_errors(context, moving, losses) * units
-    sigma, crb = np.hypot(sigma, path), np.hypot(crb, path)
-    own = np.sqrt(np.einsum("nii->ni", moving.shared)) * units
-    sigma, crb = np.hypot(sigma, own), np.hypot(crb, own)
+    own = np.sqrt(np.einsum("nii->ni", moving.shared))
+    more = np.hypot(_path_errors(context, moving, losses), own) * units
+    sigma, crb = np.hypot(sigma, more), np.hypot(crb, more)
     freedom = np.maximum(judged.pixels - index.size, 1)
     p_value = _p_values(judged.chi2, freedom, judged.worst, judged.pixels)
-    collected = judged.level / pixel**2 * collected_areas(model, estimate[:, 2], estimate[:, 3])
-    columns: dict[str, object] = {
-        "track": rows.track, "frame": rows.frame + first_frame,
-        "n_before": np.full(n, field.frames), "n_after": np.ones(n, dtype=int),
-        "x_px": estimate[:, 0] / pixel, "y_px": estimate[:, 1] / pixel,
-        "x_nm": estimate[:, 0], "y_nm": estimate[:, 1], "z_nm": estimate[:, 2], "mass_kda": mass,
-        "contrast": _contrasts(model, estimate[:, 2], estimate[:, 3]),
-        "n_scattered": collected, "snr": np.sqrt(2 * np.maximum(judged.gain, 0.0)),
-        "chi2_reduced": judged.chi2 / freedom, "p_value": p_value,
-        "flags": _flags(context, moving, sigma, p_value, losses),
-    }  # fmt: skip
-    quantum = quantum_bounds(model, estimate[:, 2], mass, collected, free)
+    place, z, amplitude = estimate[:, :2], estimate[:, 2], estimate[:, 3]
+    collected = judged.level / pixel**2 * collected_areas(model, z, amplitude)
+    columns: dict[str, object] = {"track": rows.track, "frame": rows.frame + first_frame}
+    columns |= {"n_before": np.full(n, field.frames), "n_after": np.ones(n, dtype=int)}
+    columns |= dict(zip(("x_px", "y_px"), place.T / pixel, strict=True))
+    columns |= dict(zip(PARAMETERS, (*place.T, z, mass), strict=True))
+    columns |= {"contrast": _contrasts(model, z, amplitude), "n_scattered": collected}
+    columns |= {"snr": np.sqrt(2 * np.maximum(judged.gain, 0.0)), "p_value": p_value}
+    columns |= {"chi2_reduced": judged.chi2 / freedom}
+    columns["flags"] = _flags(context, moving, sigma, p_value, losses)
+    quantum = quantum_bounds(model, z, mass, collected, free)
     for k, name in enumerate(PARAMETERS):
         columns[f"sigma_{name}"], columns[f"crb_{name}"] = sigma[:, k], crb[:, k]
         columns[f"qcrb_{name}"] = quantum[:, k]
@@ -224,22 +156,15 @@ def table_of_tracks(
     seen = table.groupby("track")["frame"].transform("size")
     table = table[seen >= min_frames]
     table = table.sort_values(["track", "frame"], kind="stable").reset_index(drop=True)
-    off = np.zeros(len(table), dtype=np.bool_)
+    texts = table["flags"]
     if parted:
         names = ("track", "mass_kda", "crb_mass_kda")
         off = has_other_mass(*(table[name].to_numpy() for name in names))
-    numbers, texts = pd.factorize(table["flags"])
-    judged = [_verdict(text, shared) for text in texts for shared in (False, True)]
-    status = [str(status) for status, _ in judged]
-    flags = [";".join(map(str, flags)) for _, flags in judged]
-    status, flags = (np.array(each, dtype=object)[2 * numbers + off] for each in (status, flags))
+        texts = texts.where(~off, texts + f";{Status.TOO_CLOSE}")
+    judged = {text: verdict(map(Status, filter(None, text.split(";")))) for text in texts.unique()}
+    status = texts.map({text: str(status) for text, (status, _) in judged.items()})
+    flags = texts.map({text: ";".join(map(str, own)) for text, (_, own) in judged.items()})
     return make_rows(table, {"status": status, "flags": flags})
-
-
-def _verdict(flags: str, shared: bool) -> tuple[Status, tuple[Status, ...]]:
-    """Derive status and flags of rows; one flag may be that the mass is shared."""
-    own = [Status(flag) for flag in flags.split(";") if flag]
-    return verdict([*own, Status.TOO_CLOSE] if shared else own)
 
 
 def common_masses(context: AnalysisContext, moving: TrackedRows) -> pd.DataFrame:
@@ -249,25 +174,22 @@ def common_masses(context: AnalysisContext, moving: TrackedRows) -> pd.DataFrame
     amplitude = np.where(known, common.amplitude, 1.0)
     mass = np.where(known, scale.mass(amplitude), np.nan)
     slope = np.abs(scale.slopes(amplitude))
-    tracks = np.arange(len(mass))
+    rows, losses = moving.rows, losses_to_blur(context, moving)
     group = np.zeros(len(mass), dtype=np.int64)
-    group[moving.rows.track] = moving.rows.group
-    loss = losses_to_blur(context, moving)[group] if len(mass) else np.zeros(0)
-    d, sigma_d = np.nan_to_num(moving.diffusion).T if len(mass) else np.zeros((2, 0))
-    rows = moving.rows
-    each = _path_errors(context, moving, losses_to_blur(context, moving)[rows.group])[:, 3]
+    group[rows.track] = rows.group
+    d, sigma_d = np.nan_to_num(moving.diffusion).T
     strength = np.abs(rows.theta[:, 3])
     # a fit that ended fainter than 1e-3 of the brightest row tells nothing of its path
-    share = (each / np.maximum(strength, 1e-3 * strength.max(initial=1e-9))) ** 2
-    count = np.maximum(np.bincount(rows.track, minlength=len(mass)), 1)
-    path = np.bincount(rows.track, weights=share, minlength=len(mass)) / count
-    path /= np.maximum(common.frames, 1.0)
-    blur = (loss * np.where(d > 0, sigma_d / np.where(d > 0, d, 1.0), 0.0)) ** 2
+    strength = np.maximum(strength, 1e-3 * strength.max(initial=1e-9))
+    share = (_path_errors(context, moving, losses[rows.group])[:, 3] / strength) ** 2
+    total, count = (np.bincount(rows.track, w, minlength=len(mass)) for w in (share, None))
+    path = total / np.maximum(count, 1) / np.maximum(common.frames, 1.0)
+    blur = (losses[group] * np.where(d > 0, sigma_d / np.where(d > 0, d, 1.0), 0.0)) ** 2
     sigma = np.sqrt(common.variance * slope**2 + mass**2 * (path + blur))
     table = pd.DataFrame({"mass_kda": mass, "sigma_mass_kda": sigma, "crb_mass_kda": sigma})
     table["blur"] = (d > 0).astype(float)
     table["told"] = np.where(known, common.known / common.variance, np.nan)
-    return table.set_index(pd.Index(tracks, name="track"))
+    return table.rename_axis("track")
 
 
 def losses_to_blur(context: AnalysisContext, moving: TrackedRows) -> FloatArray:
@@ -295,10 +217,20 @@ def loss_to_blur(context: AnalysisContext, variance_nm2: float, *, upwards: bool
 
 def _path_errors(context: AnalysisContext, moving: TrackedRows, losses: FloatArray) -> FloatArray:
     """Errors of (x, y, z, a) of each row that the unknown path of its exposure makes, (n, 4)."""
-    out = np.zeros((len(losses), 4))
-    if moving.field.free[2]:
-        return np.asarray(np.sqrt(np.einsum("nii->ni", path_covariances(context, moving))))
-    out[:, 3] = PATH_SPREAD * losses * np.abs(moving.rows.theta[:, 3])
+    rows, out = moving.rows, np.zeros((len(losses), 4))
+    if not moving.field.free[2]:
+        out[:, 3] = PATH_SPREAD * losses * np.abs(rows.theta[:, 3])
+        return out
+    level = np.median(np.maximum(moving.judged.level, 1.0)) if len(out) else 1.0
+    read_share = float(np.median(moving.field.read_e2) / level)
+    for number in np.unique(rows.group[moving.smear_nm > 0]):
+        q, mine = float(moving.variances_nm2[number]), rows.group == number
+        amplitude, model = (
+            float(np.median(rows.theta[mine, 3])),
+            blurred(context.model, q, upwards=True),
+        )
+        where = model, context.roi_px, context.pixel_nm, rows.theta[mine, 2]
+        out[mine] = np.linalg.norm(path_shifts(*where, amplitude, q, read_share), axis=2)
     return out
 
 
@@ -329,10 +261,10 @@ def _flags(
     sigma: FloatArray,
     p_value: FloatArray,
     losses: FloatArray,
-) -> NDArray[np.object_]:
+) -> pd.Series[str]:
     """Join the flags of each row with semicolons."""
     rows, free = moving.rows, np.flatnonzero(moving.field.free[:4])
-    lost = ~moving.converged | ~np.isfinite(sigma[:, free]).all(axis=1)
+    lost = ~moving.done | ~np.isfinite(sigma[:, free]).all(axis=1)
     poor = (p_value < POOR_FIT_P) | (losses > LARGEST_LOSS)
     field = moving.field
     outside = field.on_wall(rows)
@@ -344,14 +276,16 @@ def _flags(
             saturated_near(field.saturated, x, y, field.pixel_nm) for x, y in rows.theta[:, :2]
         ]
     marks = (
-        (lost, Status.NOT_CONVERGED), (outside, Status.AT_BOUND),
-        (too_bright, Status.SATURATED), (poor, Status.POOR_FIT), (moving.close, Status.TOO_CLOSE),
-    )  # fmt: skip
-    texts = [""]  # of every set of remarks; in the number of one, each remark has its bit
-    for _, mark in marks:
-        texts += [f"{text};{mark}".lstrip(";") for text in texts]
-    numbers = sum(applies.astype(np.int64) << bit for bit, (applies, _) in enumerate(marks))
-    return np.asarray(np.array(texts, dtype=object)[numbers])
+        (lost, Status.NOT_CONVERGED),
+        (outside, Status.AT_BOUND),
+        (too_bright, Status.SATURATED),
+        (poor, Status.POOR_FIT),
+        (moving.close, Status.TOO_CLOSE),
+    )
+    flags = pd.Series("", index=range(len(lost)))
+    for applies, mark in marks:
+        flags[applies] += f";{mark}"
+    return flags.str.lstrip(";")
 
 
 def _contrasts(model: ForwardModel, z_nm: FloatArray, amplitude: FloatArray) -> FloatArray:

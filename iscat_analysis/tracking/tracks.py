@@ -122,26 +122,20 @@ def _steps_of(fits: pd.DataFrame, ticks: IntArray | None) -> _Steps | None:
     sound = fits["status"].eq(Status.OK).groupby(fits["track"]).transform("mean") > 0.5
     good = fits.loc[sound & ~fits["status"].isin(NO_PLACE), ["track", "frame", "x_nm", "y_nm"]]
     good = good.sort_values(["track", "frame"])
-    step = good.diff()
-    next_ = ((step["track"] == 0) & (step["frame"] == 1)).to_numpy()
-    if ticks is not None:
-        next_ = next_ & (np.diff(ticks[good["frame"].to_numpy(int)], prepend=-1) == 1)
-    xy = step.loc[next_, ["x_nm", "y_nm"]].to_numpy(float)
-    track, frame = (good.loc[next_, name].to_numpy(dtype=np.int64) for name in ("track", "frame"))
-    variance = np.full(len(track), np.nan)
-    for k in np.unique(track):
-        mine = track == k
-        if mine.sum() >= 20:  # tell how far a particle goes
-            variance[mine] = np.median((xy[mine] ** 2).sum(axis=1)) / (2 * math.log(2))
-    used = variance > 0
-    numbers, count = np.unique(frame[used], return_counts=True)
-    numbers = numbers[count >= FEWEST_PARTICLES]
-    used &= np.isin(frame, numbers)
+    time = good["frame"] if ticks is None else ticks[good["frame"].to_numpy(int)]
+    step = good.assign(time=time).diff()
+    next_ = (step[["track", "time"]] == (0, 1)).all(axis=1) & (step["frame"] == 1)
+    steps = good[["track", "frame"]].assign(x=step["x_nm"], y=step["y_nm"])[next_]
+    of_track = (steps["x"] ** 2 + steps["y"] ** 2).groupby(steps["track"])
+    steps["variance"] = of_track.transform("median") / (2 * math.log(2))
+    # 20 steps tell how far a particle goes
+    steps = steps[(of_track.transform("size") >= 20) & (steps["variance"] > 0)]
+    steps = steps[steps.groupby("frame")["track"].transform("size") >= FEWEST_PARTICLES]
+    steps = steps.sort_values("frame", kind="stable")
+    numbers, pair = np.unique(steps["frame"].to_numpy(np.int64), return_inverse=True)
     if len(numbers) < 30:
         return None
-    order = np.flatnonzero(used)[np.argsort(frame[used], kind="stable")]
-    pair = np.searchsorted(numbers, frame[order]).astype(np.int64)
-    return _Steps(pair, numbers.astype(np.int64), xy[order], variance[order])
+    return _Steps(pair, numbers, steps[["x", "y"]].to_numpy(), steps["variance"].to_numpy())
 
 
 def _shared_steps(steps: _Steps, frame_rate_hz: float | None) -> Finding | None:
@@ -176,17 +170,13 @@ def _normalized_squares(steps: _Steps) -> tuple[FloatArray, FloatArray]:
 def _jumps(steps: _Steps) -> list[tuple[int, Finding]]:
     """Find frames between which all particles go so far that frames must be missing."""
     surprise, particles = _normalized_squares(steps)
-    total = steps.total(surprise)
-    largest = np.zeros(len(total))
+    total, largest = steps.total(surprise), np.zeros(len(particles))
     np.maximum.at(largest, steps.frame, surprise)
-    most, others = np.zeros(len(total)), np.zeros(len(total))
-    missing = np.zeros(len(total), dtype=np.int64)
-    for gap in _GAPS:
-        gain = total * (1 - 1 / gap) - particles * math.log(gap)
-        missing[gain > most] = gap - 1
-        most = np.maximum(most, gain)
-        rest = (total - largest) * (1 - 1 / gap) - (particles - 1) * math.log(gap)
-        others = np.maximum(others, rest)
+    gaps = np.array(_GAPS)[:, None]
+    gain = total * (1 - 1 / gaps) - particles * np.log(gaps)
+    most, missing = gain.max(axis=0), np.array(_GAPS)[gain.argmax(axis=0)] - 1
+    rest = (total - largest) * (1 - 1 / gaps) - (particles - 1) * np.log(gaps)
+    others = rest.max(axis=0)
     # 7.0 of log-likelihood without the farthest particle, which may be another
     found: BoolArray = (most > _UNLIKELY + math.log(len(total))) & (others > 7.0)
     out = []
@@ -385,20 +375,19 @@ def cut_steps(tracks: pd.DataFrame, setup: TrackSetup, reach_nm: float) -> Findi
 def _summary(tracks: pd.DataFrame, setup: TrackSetup) -> dict[str, Any]:
     """Count and take medians over the tracks that are ok."""
     good = tracks[tracks["status"] == TrackStatus.OK]
+
+    def median(values: pd.Series[float]) -> float | None:
+        return float(values.median()) if values.notna().any() else None
+
     names = ("n_frames", "mass_kda", "d_um2_s", "diameter_nm", "refractive_index")
-    medians = {}
-    for name in names:
-        values = good[name].dropna().to_numpy(float)
-        medians[name] = float(np.median(values)) if values.size else None
-    ratios = good["sigma_d_um2_s"] / good["d_um2_s"]
     flags = Counter(flag for flags in tracks["flags"] for flag in flags.split(";") if flag)
     return {
         "frame_rate_hz": setup.frame_rate_hz,
         "exposure_ms": setup.exposure_ms,
         "status": dict(sorted(Counter(tracks["status"]).items())),
         "flags": dict(sorted(flags.items())),
-        "medians": medians,
-        "sigma_d_over_d_median": float(ratios.median()) if ratios.notna().any() else None,
+        "medians": {name: median(good[name]) for name in names},
+        "sigma_d_over_d_median": median(good["sigma_d_um2_s"] / good["d_um2_s"]),
         "begin_inside": int((tracks["begins"] == "inside").sum()),
         "end_inside": int((tracks["ends"] == "inside").sum()),
         "cross_border": int(((tracks["begins"] == "border") | (tracks["ends"] == "border")).sum()),

@@ -10,7 +10,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.model import blurred
 from iscat_analysis.tracking.linking import link
-from iscat_analysis.tracking.table import SKEW, SKEW_ACROSS, path_covariance
+from iscat_analysis.tracking.table import SKEW, SKEW_ACROSS, path_shifts
 
 ROI, VARIANCE_NM2, PATHS, PARTS = 24, 120.0, 400, 48
 SIGMAS = 4.0
@@ -45,7 +45,8 @@ def test_paths_scatter_fits_as_said(z_nm: float) -> None:
         )
         errors.append(pinned @ (seen - signal).ravel())
     found = np.std(errors, axis=0)
-    said = np.sqrt(np.diag(path_covariance(still, ROI, PIXEL_NM, z_nm, amplitude, VARIANCE_NM2)))
+    (shifts,) = path_shifts(still, ROI, PIXEL_NM, np.array([z_nm]), amplitude, VARIANCE_NM2)
+    said = np.linalg.norm(shifts, axis=1)
     # what of the square of a spread is not in first order is q k² ≈ 0.12 of it
     assert np.all(np.abs(found / said - 1) < 0.12 + SIGMAS / np.sqrt(PATHS))
 
