@@ -56,15 +56,12 @@ def track_in_frames(
 ) -> DetectionResult:
     """Fit each frame by itself over a recorded background, and link the fits."""
     movie, camera, windows = ready.steady, ready.camera, ground.windows
-    found = track_frames(
-        ground.context, movie, camera, windows, ground.summary,
-        check=checked(movie, camera), pool=pool, progress=run.progress,
-        doubt=ground.doubt, report=run.report,
-    )  # fmt: skip
+    recording = Recording(movie, camera, checked(movie, camera), pool, run.progress)
+    found = track_frames(ground.context, recording, windows, doubt=ground.doubt, report=run.report)
     if not windows.n_before:
         noise = _judge_beside_particles(ready, ground.context, windows, found.fits)
         run.report(*noise.findings)
-    return found
+    return replace(found, summary=ground.summary)
 
 
 class StoredInDarkField(StoredEvents):

@@ -20,8 +20,7 @@ no single height describes them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +29,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.camera import Camera, Check, add_frames, start_power
+from iscat_analysis.camera import add_frames, start_power
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis import (
     Prepared,
@@ -49,14 +48,12 @@ from iscat_analysis.fitting.field import add_signal, fit_field
 from iscat_analysis.fitting.ranges import checked, fitted_frames, measured_windows
 from iscat_analysis.fitting.results import Compared, DetectionResult, Followed, lines_of, view_of
 from iscat_analysis.fitting.run import RESUMPTION_HINT, Run, saying
-from iscat_analysis.movie import Stack
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.optics.model import PATH_SPREAD, blurred, path_variance_nm2
 from iscat_analysis.records import (
     BoolArray,
     EventView,
     FloatArray,
-    FrameSource,
     Progress,
     Status,
     Windows,
@@ -80,7 +77,7 @@ from iscat_analysis.tracking.frames import (
 )
 from iscat_analysis.tracking.linking import link
 from iscat_analysis.tracking.optics import TrialTracks, learn_from_tracks
-from iscat_analysis.tracking.sizes import sphere_track, table_of_sizes
+from iscat_analysis.tracking.sizes import SphereTrack, sphere_track, table_of_sizes
 from iscat_analysis.tracking.stages import find_rows_and_background
 from iscat_analysis.tracking.table import loss_to_blur, moving_table
 from iscat_analysis.tracking.tracks import mass_correlation
@@ -102,14 +99,12 @@ def held_height_warning(
     if config.track.free != "joint" or not len(fits):
         return None
     first, last = span[0], min(span[1], span[0] + 200)
-    free = _rejected(fits[(fits["frame"] >= first) & (fits["frame"] < last)])
+    free = _rejected(fits[fits["frame"].between(first, last - 1)])
     if free.size == 0 or free.mean() <= MOST_REJECTED:
         return None
     track = config.track.model_copy(update={"free": "mass"})
-    config = config.model_copy(update={"track": track})
-    movie = recording.movie
-    _, tall, wide = movie.shape
-    context = tracking_context(config, (tall, wide), last - first)
+    config, movie = config.model_copy(update={"track": track}), recording.movie
+    context = tracking_context(config, (movie.shape[1], movie.shape[2]), last - first)
     try:
         quietly = replace(recording, progress=silent)
         moving = find_rows_and_background(context, quietly, (first, last))
@@ -126,51 +121,6 @@ def held_height_warning(
 def _rejected(rows: pd.DataFrame) -> BoolArray:
     """Tell which rows the model does not describe."""
     return np.asarray(rows["flags"].fillna("").str.contains(_REJECTED), dtype=np.bool_)
-
-
-Track = Callable[[AnalysisContext, Windows], DetectionResult]
-"""Fits every frame over a background, and links the fits."""
-
-
-def in_turns(
-    config: Config, context: AnalysisContext, windows: Windows, track: Track
-) -> DetectionResult:
-    """Track particles over a background that is learnt with them, from the median of all frames."""
-    sharp, variance_nm2 = context, 0.0
-    upwards = config.track.free == "joint"
-    last: FloatArray | None = None
-    for turn in range(12):
-        found = track(context, windows)
-        if found.interrupted:
-            break
-        ground = beside_particles(context, windows, found.fits)
-        error = np.sqrt(np.maximum(ground + windows.read_variance_before_e2, 1.0))
-        step = np.where(windows.masked, 0.0, (ground - windows.before_e) / error)
-        # 0.3 σ of the mass of a track, if all of the change were its own
-        if turn > 1 and math.sqrt(np.sum(step**2)) < 0.3:
-            break
-        if last is not None:  # turns come nearer by one factor each, as slowly as particles move
-            factor = np.sum(step * last) / np.sum(last**2)
-            # factors above 0.8 are not extrapolated
-            step = step / (1 - min(max(factor, 0.0), 0.8))
-        last = step if turn else None
-        windows = replace(windows, before_e=np.maximum(windows.before_e + step * error, 0.0))
-        variance_nm2 = _path_variance_nm2(config, found.fits)
-        near, far = (
-            blurred(model, variance_nm2, upwards=upwards) for model in (sharp.model, sharp.wide)
-        )
-        context = replace(sharp, model=near, wide=far)
-    fits = found.fits
-    path = PATH_SPREAD * loss_to_blur(sharp, variance_nm2, upwards=upwards) * fits["mass_kda"].abs()
-    errors = ("sigma_mass_kda", "crb_mass_kda")
-    wider = {name: np.hypot(fits[name], path) for name in errors}
-    return replace(
-        found,
-        context=replace(sharp, mode="track", config=config),
-        fits=fits.assign(**wider),
-        repeats=(),
-        empty=None,
-    )
 
 
 def beside_particles(context: AnalysisContext, windows: Windows, fits: pd.DataFrame) -> FloatArray:
@@ -205,48 +155,75 @@ def _path_variance_nm2(config: Config, fits: pd.DataFrame) -> float:
 
 
 _STEPS = 100  # of the progress of a block
-_PATTERN = 6  # places in a frame that are taken for the light's unevenness,
-_PATTERN_SHARE = 0.8  # where so many of them are no particles
 
 
 def find_moving(ready: Prepared, run: Run) -> DetectionResult:
     """Track particles over backgrounds that are learnt with them."""
     config, camera = ready.config, ready.camera
     additive = config.optics.scheme == "darkfield"
-    span = fitted_frames(ready.steady, config)
-    kept = keep_frames(ready.steady, camera, span, additive=additive)
+    kept = keep_frames(ready.steady, camera, fitted_frames(ready.steady, config), additive=additive)
     movie, (first, last) = kept.movie, kept.span
     run.report(kept.finding)
     run.clock.lap("model")
     check = checked(movie, camera)
-    if additive:
-        return kept.put_back(_find_in_dark_field(ready, run, movie, (first, last)))
-    jitter_future = start_in_thread(pattern_jitter_warning, movie, camera, (first, last))
     with threads(config.compute.workers) as pool:
-        plan = plan_blocks(movie, config, camera, check=check, span=kept.span, mapper=pool.map)
+        recording = Recording(movie, camera, check, pool, run.progress)
+        find = _find_in_dark_field if additive else _find_in_blocks
+        return kept.put_back(find(ready, run, recording, (first, last)))
+
+
+def _find_in_blocks(
+    ready: Prepared, run: Run, recording: Recording, span: tuple[int, int]
+) -> DetectionResult:
+    """Track particles that dim or brighten backgrounds, which are learnt block by block."""
+    config, movie, camera = ready.config, recording.movie, recording.camera
+    jitter_future = start_in_thread(pattern_jitter_warning, movie, camera, span)
+    plan = plan_blocks(
+        movie, config, camera, check=recording.check, span=span, mapper=recording.pool.map
+    )
     jitter = jitter_future.result()
     run.report(plan.finding(movie.name), jitter and replace(jitter, where=movie.name))
     run.clock.lap("background")
     identity = ready.steady.identity if run.partial else ""
     shelves: list[BlockStore] = []
 
-    def shelf(config: Config, folder: Path | None) -> BlockStore:
-        shelves.append(BlockStore(folder, config, identity, ready.shape, (first, last), camera))
-        return shelves[-1]
+    def analysed(
+        context: AnalysisContext, number: int, folder: Path | None, *, cautious: bool = False
+    ) -> Block:
+        """Load a finished block, or analyse it."""
+        count, part = len(plan.spans), plan.spans[number]
+        store = BlockStore(folder, context.config, identity, ready.shape, span, camera)
+        shelves.append(store)
+        source = recording
+        if count > 1:
+            source = replace(recording, progress=_part_of(recording.progress, number, count))
+        block: Block | None = store.load(number)
+        if block is not None and block.span == part:
+            source.progress("track", 1, 1)
+            return block
+        goes_on = number > 0, number + 1 < count
+        block = analyse_block(context, source, part, goes_on=goes_on, cautious=cautious)
+        store.save(number, block)
+        return block
 
-    with _with_resumption_hint(shelves, plan), threads(config.compute.workers) as pool:
-        recording = Recording(movie, camera, check, pool, run.progress)
+    def begin(config: Config, *, cautious: bool = False) -> TrialTracks:
+        context = tracking_context(config, ready.shape, max(span[1] - span[0], 1), ready.lines)
+        folder = None if cautious else run.partial
+        return TrialTracks(config, context, analysed(context, 0, folder, cautious=cautious))
 
-        def begin(config: Config, *, cautious: bool = False) -> TrialTracks:
-            context = tracking_context(config, ready.shape, max(last - first, 1), ready.lines)
-            store = shelf(config, None if cautious else run.partial)
-            block = _analysed(context, recording, plan, store, 0, cautious=cautious)
-            return TrialTracks(config, context, block)
-
-        begun, learned = learn_from_tracks(config, begin, name=movie.name, pool=pool, run=run)
-        config, context = begun.config, begun.context
-        store = shelf(config, run.partial)
-        blocks, interrupted = track_movie(context, recording, plan, store, begun.block)
+    interrupted = False
+    with _with_resumption_hint(shelves, plan):
+        begun, learned = learn_from_tracks(
+            config, begin, name=movie.name, pool=recording.pool, run=run
+        )
+        config, context, blocks = begun.config, begun.context, [begun.block]
+        try:
+            for number in range(1, len(plan.spans)):
+                blocks.append(analysed(context, number, run.partial))
+        except KeyboardInterrupt:
+            run.progress("report", 0, 1)  # to gather and keep finished blocks takes a moment
+            recording.pool.shutdown(wait=False, cancel_futures=True)
+            interrupted = True
         joined = join_blocks(config, blocks, camera)
         if not interrupted and not fixed_height_warning(config, joined.fits):
             run.report(held_height_warning(ready.config, recording, plan.spans[0], joined.fits))
@@ -256,7 +233,7 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
     if not len(joined.fits) and not interrupted:
         run.report(_nothing_found(context, blocks[0], movie.name))
     run.clock.lap("track")
-    found = DetectionResult(
+    return DetectionResult(
         context=replace(context, mode="track", config=config),
         fits=joined.fits,
         views=joined.views,
@@ -267,32 +244,53 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
         optics=learned,
         interrupted=interrupted,
     )
-    return kept.put_back(found)
 
 
 def _find_in_dark_field(
-    ready: Prepared, run: Run, movie: Stack, span: tuple[int, int]
+    ready: Prepared, run: Run, recording: Recording, span: tuple[int, int]
 ) -> DetectionResult:
-    """Track particles that add their light to a background that is learnt with them."""
-    config, camera, frames = ready.config, ready.camera, span[1] - span[0]
-    refuse_few_frames(movie.name, frames)
-    windows = measured_windows(movie, config, camera, span, span, progress=run.progress)
+    """Track particles that add their light to a background that is learnt with them.
+
+    The background is found in turns, from the median of all frames.
+    """
+    config, frames = ready.config, span[1] - span[0]
+    refuse_few_frames(recording.movie.name, frames)
+    windows = measured_windows(
+        recording.movie, config, ready.camera, span, span, progress=run.progress
+    )
     run.clock.lap("background")
-    last = Findings()
-    with threads(config.compute.workers) as pool:
-
-        def track(context: AnalysisContext, windows: Windows) -> DetectionResult:
-            last.made.clear()  # only the last turn has the background
-            return track_frames(
-                context, movie, camera, windows, {},
-                check=checked(movie, camera), pool=pool, progress=run.progress, report=last.add,
-            )  # fmt: skip
-
-        context = tracking_context(config, ready.shape, frames, ready.lines)
-        found = in_turns(config, context, windows, track)
-    run.report(*last.made)
+    context = sharp = tracking_context(config, ready.shape, frames, ready.lines)
+    variance_nm2, upwards = 0.0, config.track.free == "joint"
+    last: FloatArray | None = None
+    for turn in range(12):
+        told = Findings()  # only the last turn has the background
+        found = track_frames(context, recording, windows, report=told.add)
+        if found.interrupted:
+            break
+        ground = beside_particles(context, windows, found.fits)
+        error = np.sqrt(np.maximum(ground + windows.read_variance_before_e2, 1.0))
+        step = np.where(windows.masked, 0.0, (ground - windows.before_e) / error)
+        # 0.3 σ of the mass of a track, if all of the change were its own
+        if turn > 1 and math.sqrt(np.sum(step**2)) < 0.3:
+            break
+        if last is not None:  # turns come nearer by one factor each, as slowly as particles move
+            factor = np.sum(step * last) / np.sum(last**2)
+            # factors above 0.8 are not extrapolated
+            step = step / (1 - min(max(factor, 0.0), 0.8))
+        last = step if turn else None
+        windows = replace(windows, before_e=np.maximum(windows.before_e + step * error, 0.0))
+        variance_nm2 = _path_variance_nm2(config, found.fits)
+        near, far = (
+            blurred(model, variance_nm2, upwards=upwards) for model in (sharp.model, sharp.wide)
+        )
+        context = replace(sharp, model=near, wide=far)
+    run.report(*told.made)
     run.clock.lap("track")
-    return found
+    fits = found.fits
+    path = PATH_SPREAD * loss_to_blur(sharp, variance_nm2, upwards=upwards) * fits["mass_kda"].abs()
+    wider = {name: np.hypot(fits[name], path) for name in ("sigma_mass_kda", "crb_mass_kda")}
+    context = replace(sharp, mode="track", config=config)
+    return replace(found, context=context, fits=fits.assign(**wider), repeats=(), empty=None)
 
 
 @contextmanager
@@ -323,44 +321,6 @@ def _nothing_found(context: AnalysisContext, block: Block, name: str) -> Finding
     return NO_PARTICLE_MOVES({**values, "threshold": context.templates.threshold}, where=name)
 
 
-def track_movie(
-    context: AnalysisContext, recording: Recording, plan: Plan, store: BlockStore, first: Block
-) -> tuple[list[Block], bool]:
-    """Track particles that are there in all frames, over backgrounds learnt with them."""
-    blocks, interrupted = [first], False
-    try:
-        for number in range(1, len(plan.spans)):
-            blocks.append(_analysed(context, recording, plan, store, number))
-    except KeyboardInterrupt:
-        recording.progress("report", 0, 1)  # to gather and keep finished blocks takes a moment
-        recording.pool.shutdown(wait=False, cancel_futures=True)
-        interrupted = True
-    return blocks, interrupted
-
-
-def _analysed(
-    context: AnalysisContext,
-    recording: Recording,
-    plan: Plan,
-    store: BlockStore,
-    number: int,
-    *,
-    cautious: bool = False,
-) -> Block:
-    """Load a finished block, or analyse it."""
-    count, span = len(plan.spans), plan.spans[number]
-    if count > 1:
-        recording = replace(recording, progress=_part_of(recording.progress, number, count))
-    block: Block | None = store.load(number)
-    if block is not None and block.span == span:
-        recording.progress("track", 1, 1)
-        return block
-    goes_on = number > 0, number + 1 < count
-    block = analyse_block(context, recording, span, goes_on=goes_on, cautious=cautious)
-    store.save(number, block)
-    return block
-
-
 def _part_of(progress: Progress, number: int, count: int) -> Progress:
     """Report the progress of one block as progress of all blocks."""
 
@@ -373,34 +333,31 @@ def _part_of(progress: Progress, number: int, count: int) -> Progress:
 
 def track_frames(
     context: AnalysisContext,
-    movie: FrameSource,
-    camera: Camera,
+    recording: Recording,
     windows: Windows,
-    summary: Mapping[str, Any],
     *,
-    check: Check,
-    pool: ThreadPoolExecutor,
-    progress: Progress,
     doubt: str = "",
     report: Callable[[Finding], None],
 ) -> DetectionResult:
     """Fit each frame after the background, starting from the frame before, and link."""
-    first, last = windows.frames_after
-    lines: list[dict[str, Any]] = []
-    views: list[EventView] = []
+    movie, camera, (first, last) = recording.movie, recording.camera, windows.frames_after
+    found: list[tuple[Event, dict[str, Any], EventView]] = []
     repeats: list[FloatArray] = []
     noise: FrameNoise | None = None
     events: tuple[Event, ...] = ()
-    spheres: list[Event] = []  # whose diameters all frames tell together
     interrupted = False
     shown = np.ones(last - first, dtype=np.bool_)
     if not context.additive:
         shown = well_lit(windows.power, DARK)[-shown.size :]
     try:
         for frame in (first + np.flatnonzero(shown)).tolist():
-            here = _one_frame(movie, camera, windows, frame, check, context)
+            counts = movie.read(frame, frame + 1)
+            recording.check(counts, frame)
+            here = add_frames(windows, camera, counts, frame)
+            if context.config.background.power_normalization:
+                here = start_power(here)
             starts = [event.candidate for event in events]
-            events, here = fit_field(context, here, starts=starts, pool=pool)
+            events, here = fit_field(context, here, starts=starts, pool=recording.pool)
             if events and noise is None:
                 if cause := misfit_warning(context.config, events):
                     report(MODEL_MISFITS({"cause": cause}))
@@ -410,41 +367,37 @@ def track_frames(
                 noise = FrameNoise(context, windows, read, [event.fit for event in events])
             if events and noise is not None:
                 repeats += [noise.look(here, events)] * len(events)
-            views += [view_of(number, event) for number, event in enumerate(events)]
-            spheres += events if context.model.is_sized else ()
-            lines += lines_of(context, events)  # last, so that an interrupted frame has no rows
-            progress("track", frame + 1 - first, last - first)
+            views = [view_of(number, event) for number, event in enumerate(events)]
+            found += zip(events, lines_of(context, events), views, strict=True)
+            recording.progress("track", frame + 1 - first, last - first)
     except KeyboardInterrupt:
         interrupted = True
     track = context.config.track
-    places = np.array([(line["x_nm"], line["y_nm"]) for line in lines]).reshape(-1, 2)
-    frames = np.array([line["frame"] for line in lines], dtype=np.int64)
+    places = np.array([(line["x_nm"], line["y_nm"]) for _, line, _ in found]).reshape(-1, 2)
+    frames = np.array([line["frame"] for _, line, _ in found], dtype=np.int64)
     numbers = link(frames, places, reach_nm=track.max_step_nm, memory=track.memory_frames)
     order = np.lexsort((frames, numbers))
-    own = numbers[order]
+    own, found = numbers[order], [found[k] for k in order]
     masses: pd.DataFrame | None = None
-    if context.model.is_sized:
-        tracked = {
-            number: sphere_track(context, [spheres[k] for k in order[own == number]], pool)
-            for number in np.unique(own).tolist()
-        }
-        again = [event for track in tracked.values() for event in track.events]
-        for k, event, line in zip(order, again, lines_of(context, again), strict=True):
-            lines[k], views[k] = line, view_of(0, event)
-    fits = make_rows([lines[k] for k in order], {"event": own, "track": own})
+    tracked: dict[int, SphereTrack] = {}
+    if context.model.is_sized:  # all frames of a track tell its diameter together
+        for number in np.unique(own).tolist():
+            mine = [event for (event, *_), k in zip(found, own, strict=True) if k == number]
+            tracked[number] = sphere_track(context, mine, recording.pool)
+        again = [event for one in tracked.values() for event in one.events]
+        views = [view_of(0, event) for event in again]
+        found = list(zip(again, lines_of(context, again), views, strict=True))
+    fits = make_rows([line for _, line, _ in found], {"event": own, "track": own})
     if context.model.is_sized:
         masses = table_of_sizes(tracked, mass_correlation(context, fits))
-    seen: dict[int, EventView] = {}
-    for number, view in zip(numbers.tolist(), views[: len(lines)], strict=True):
-        if number not in seen:
-            seen[number] = replace(view, event=number)
+    firsts = np.unique(own, return_index=True)[1].tolist()
     return DetectionResult(
         context=context,
         fits=fits,
-        views=tuple(seen[number] for number in sorted(seen)),
+        views=tuple(replace(found[k][2], event=int(own[k])) for k in firsts),
         image=contrast_image(context, windows),
         compared=Compared.of(windows),
-        summary=summary,
+        summary={},
         repeats=tuple(repeats[row] for row in order),
         empty=noise.spread if noise else None,
         followed=Followed(windows, masses=masses),
@@ -455,22 +408,9 @@ def track_frames(
 def _refuse_pattern(doubt: str, frame: int, events: Sequence[Event]) -> None:
     """Refuse a movie in which the fixed pattern was found instead of particles."""
     poor = sum(Status.POOR_FIT in event.flags for event in events)
-    if len(events) >= _PATTERN and poor >= _PATTERN_SHARE * len(events):
+    # 6 places of a frame, of which 0.8 are no particles, are taken for the light's unevenness
+    if len(events) >= 6 and poor >= 0.8 * len(events):
         raise DataError(
             f"of {len(events)} places in frame {frame} that look like particles {poor} do not look "
             f"like the model's picture, and would be followed through all frames: {doubt}"
         )
-
-
-def _one_frame(
-    movie: FrameSource,
-    camera: Camera,
-    windows: Windows,
-    frame: int,
-    check: Check,
-    context: AnalysisContext,
-) -> Windows:
-    counts = movie.read(frame, frame + 1)
-    check(counts, frame)
-    single = add_frames(windows, camera, counts, frame)
-    return start_power(single) if context.config.background.power_normalization else single
