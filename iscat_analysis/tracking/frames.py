@@ -47,7 +47,6 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.tracks import BLOCKS_FOLLOW_DRIFT, TRACKED_FRAMES_LEFT_OUT
 from iscat_analysis.fitting.context import AnalysisContext, make_context
-from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.movie import Stack, StackFrames
 from iscat_analysis.records import (
@@ -128,30 +127,27 @@ def plan_blocks(
     camera: Camera,
     *,
     check: Check,
-    span: tuple[int, int] | None = None,
+    span: tuple[int, int],
     mapper: Mapper = map,
 ) -> Plan:
     """Divide a movie into blocks of frames that have a background each."""
-    first, last = span or fitted_frames(movie, config)
+    first, last = span
     frames, pixels = last - first, movie.shape[1] * movie.shape[2]
-    room = int(config.compute.memory_limit_mb * 1e6) // (BYTES * pixels)
-    given = None if config.track.block_frames == "auto" else config.track.block_frames
-    longest = given or max(room, LEAST_FRAMES)
+    memory_mb, given = config.compute.memory_limit_mb, config.track.block_frames
+    room = int(memory_mb * 1e6) // (BYTES * pixels)
+    longest = max(room, LEAST_FRAMES) if given == "auto" else given
     count = max(1, min(math.ceil(frames / longest), frames // LEAST_FRAMES))
     needed = math.ceil(frames / count)
     if needed > room and frames >= LEAST_FRAMES:
-        advice = "raise it" if given is None else "raise it, or lower track.block_frames"
+        advice = "raise it" if given == "auto" else "raise it, or lower track.block_frames"
         raise DataError(
             f"{movie.name}: a block of {needed} frames takes {BYTES * needed * pixels / 1e6:.0f} "
-            "MB of memory, more than compute.memory_limit_mb = "
-            f"{config.compute.memory_limit_mb}: {advice}"
+            f"MB of memory, more than compute.memory_limit_mb = {memory_mb}: {advice}"
         )
+    motion = None
     # a pattern is followed in fields of 32 pixels and more
-    if given is not None or frames < 2 * SHORTEST or min(movie.shape[1:]) < 32:
-        return Plan(_spans(first, last, count))
-    motion, stiffness = follow_light(
-        movie, camera, (first, last), config, check=check, mapper=mapper
-    )
+    if given == "auto" and frames >= 2 * SHORTEST and min(movie.shape[1:]) >= 32:
+        motion, stiffness = follow_light(movie, camera, span, config, check=check, mapper=mapper)
     if motion is None:
         return Plan(_spans(first, last, count))
     shift = motion.at(np.arange(first, last, dtype=float))
@@ -162,11 +158,10 @@ def plan_blocks(
         whole = drift_over_counting(shift, stiffness, _spans(0, frames, count))
         return max(whole - unrest * frames / count, 0.0)
 
-    least, most, cost = count, max(count, frames // SHORTEST), cost_of(count)
-    while cost > MOST_DRIFT_OVER_COUNTING and count < most:
-        count += 1
-        cost = cost_of(count)
-    return Plan(_spans(first, last, count), moved, cost, count > least)
+    most = max(count, frames // SHORTEST)
+    short = (n for n in range(count, most) if cost_of(n) <= MOST_DRIFT_OVER_COUNTING)
+    blocks = next(short, most)
+    return Plan(_spans(first, last, blocks), moved, cost_of(blocks), blocks > count)
 
 
 def drift_over_counting(
@@ -203,21 +198,18 @@ def follow_light(
     # at most 64 sums, of 20 frames or more: the more frames, the less particles in them pull
     count = max(2, min(64, most, (last - first) // 20))
     spans = _spans(first, last, count)
-    sums, saturated = np.zeros((count, *shape)), np.zeros(shape, dtype=bool)
+    sums, full = np.zeros((count, *shape)), np.zeros((count, *shape), dtype=bool)
 
-    def add_up(part: int) -> BoolArray:
-        full = np.zeros(shape, dtype=np.bool_)
+    def add_up(part: int) -> None:
         for start in range(*spans[part], _READ):
             raw = movie.read(start, min(start + _READ, spans[part][1]))
             check(raw, start)
-            full |= camera.saturated(raw).any(axis=0)
+            full[part] |= camera.saturated(raw).any(axis=0)
             sums[part] += len(raw) * camera.to_electrons(raw.mean(axis=0))
-        return full
 
-    for full in mapper(add_up, range(count)):
-        saturated |= full
+    list(mapper(add_up, range(count)))
     read = np.broadcast_to(camera.read_variance_e2(shape), shape)
-    usable = ~(saturated | find_defects(sums.sum(axis=0), (last - first) * read))
+    usable = ~(full.any(axis=0) | find_defects(sums.sum(axis=0), (last - first) * read))
     light = sums[:, usable].mean(axis=1) if usable.any() else np.zeros(count)
     lengths = np.array([high - low for low, high in spans])
     if not light.sum() > 0:
@@ -296,38 +288,29 @@ def keep_frames(
     movie: Stack, camera: Camera, span: tuple[int, int], *, additive: bool = False
 ) -> FrameSubset:
     """Leave out frames that repeat others or have no light."""
-    dark, repeats = _odd(movie, camera, span, additive=additive)
+    light_e, repeats = np.empty(span[1] - span[0]), np.empty(span[1] - span[0], dtype=np.bool_)
+    for start in range(*span, _READ):
+        begin, stop = max(start - 1, span[0]), min(start + _READ, span[1])
+        here = slice(start - span[0], stop - span[0])
+        measured = measure_frames(movie.read(begin, stop), camera)
+        light_e[here], repeats[here] = (each[start - begin :] for each in measured)
+    dark = np.isneginf(light_e) if additive else ~well_lit(light_e, DARK)
     good = ~(dark | repeats)
     if good.all() or not good.any():
         return FrameSubset(movie, span)
     numbers = span[0] + np.flatnonzero(good)
     seen = movie.seen_as(StackFrames(movie, numbers))
     missing, share = span[0] + np.flatnonzero(~good), float(np.mean(repeats & ~dark))
-    words = ("s", "are", "repeat") if len(missing) > 1 else ("", "is", "repeats")
-    values = dict(zip(("s", "are", "repeat"), words, strict=True))
-    many = ""
+    values = {"s": "", "are": "is", "repeat": "repeats", "frames": listed(missing, 4), "many": ""}
+    if len(missing) > 1:
+        values |= {"s": "s", "are": "are", "repeat": "repeat"}
     if share > MANY:
-        many = (
+        values["many"] = (
             f"; {share:.0%} of the frames: if the file holds each of the camera's several times, D "
             "is too small by as much; export it with each once, at the camera's own rate"
         )
-    values |= {"frames": listed(missing, 4), "many": many}
     finding = TRACKED_FRAMES_LEFT_OUT(values, where=movie.name)
     return FrameSubset(seen, (0, len(numbers)), numbers, finding)
-
-
-def _odd(
-    movie: Stack, camera: Camera, span: tuple[int, int], *, additive: bool
-) -> tuple[BoolArray, BoolArray]:
-    """Tell which frames have no light, and which repeat those before them."""
-    light_e = np.empty(span[1] - span[0])
-    same = np.empty(light_e.size, dtype=np.bool_)
-    for start in range(*span, _READ):
-        begin, stop = max(start - 1, span[0]), min(start + _READ, span[1])
-        light, repeats = measure_frames(movie.read(begin, stop), camera)
-        here = slice(start - span[0], stop - span[0])
-        light_e[here], same[here] = light[start - begin :], repeats[start - begin :]
-    return np.isneginf(light_e) if additive else ~well_lit(light_e, DARK), same
 
 
 def _renumbered(windows: Windows, numbers: IntArray) -> Windows:
@@ -392,26 +375,28 @@ def load_field(
     movie, camera, (first, last) = recording.movie, recording.camera, span
     frames, shape = last - first, (movie.shape[1], movie.shape[2])
     refuse_few_frames(movie.name, frames)
-    exposures = _room_for((frames, *shape), movie.dtype, camera)
+    gain, offset = camera.gain_e_per_adu, camera.offset_adu
+    small = np.can_cast(movie.dtype, np.uint16)
+    if small and isinstance(gain, float) and isinstance(offset, float):
+        exposures = Exposures(np.empty((frames, *shape), dtype=np.uint16), gain, offset)
+    else:
+        exposures = Exposures(np.empty((frames, *shape), dtype=np.float32))
     counts = exposures.counts
-    saturated, total, light = np.zeros(shape, dtype=bool), np.zeros(shape), np.empty(frames)
 
-    def read_some(start: int) -> tuple[BoolArray, FloatArray]:
+    def read_some(start: int) -> BoolArray:
         raw = movie.read(start, min(start + _BLOCK, last))
         recording.check(raw, start)
-        part = counts[start - first : start - first + len(raw)]
-        part[:] = raw if counts.dtype == np.uint16 else camera.to_electrons(raw)
-        light[start - first :][: len(raw)] = part.mean(axis=(1, 2), dtype=np.float64)
-        full = np.asarray(camera.saturated(raw).any(axis=0))
-        return full, np.sum(part, axis=0, dtype=np.float64)
+        stored = raw if counts.dtype == np.uint16 else camera.to_electrons(raw)
+        counts[start - first : start - first + len(raw)] = stored
+        return np.asarray(camera.saturated(raw).any(axis=0))
 
-    starts = range(first, last, _BLOCK)
-    for start, (full, added) in zip(starts, recording.pool.map(read_some, starts), strict=True):
+    starts, saturated = range(first, last, _BLOCK), np.zeros(shape, dtype=bool)
+    for start, full in zip(starts, recording.pool.map(read_some, starts), strict=True):
         saturated |= full
-        total += added
         recording.progress("background", min(start + _BLOCK, last) - first, frames)
     read = np.broadcast_to(camera.read_variance_e2(shape), shape)
-    total, light = exposures.in_electrons(total, frames), exposures.in_electrons(light, 1)
+    total = exposures.in_electrons(counts.sum(axis=0, dtype=np.float64), frames)
+    light = exposures.in_electrons(counts.mean(axis=(1, 2), dtype=np.float64), 1)
     masked = saturated | find_defects(total, frames * read)
     masked |= _noisy(exposures, light, total / frames + read)
     return MovingField(
@@ -462,14 +447,6 @@ def restore_particle_light(
         return np.multiply(divided, lines.taken(signal[start:stop].astype(np.float64)))
 
     field.renew(block)
-
-
-def _room_for(shape: tuple[int, int, int], stored: np.dtype[Any], camera: Camera) -> Exposures:
-    """Allocate the frames, as stored integers where these are small and share one gain."""
-    gain, offset = camera.gain_e_per_adu, camera.offset_adu
-    if np.can_cast(stored, np.uint16) and isinstance(gain, float) and isinstance(offset, float):
-        return Exposures(np.empty(shape, dtype=np.uint16), gain, offset)
-    return Exposures(np.empty(shape, dtype=np.float32))
 
 
 def _noisy(exposures: Exposures, light_e: FloatArray, variance_e2: FloatArray) -> BoolArray:

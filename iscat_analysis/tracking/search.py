@@ -8,9 +8,9 @@ is not theirs alone yet: the sign of the contrast is the model's.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +35,7 @@ _HIGHER = 2.5
 """What rings may be through optics that are not the model's, over those of the model."""
 
 
-@dataclass(frozen=True)
-class FrameCandidates:
+class FrameCandidates(NamedTuple):
     """Candidates in frames, in the order of the frames."""
 
     frame: IntArray
@@ -45,6 +44,15 @@ class FrameCandidates:
     z_nm: FloatArray
     strength: FloatArray
     snr: FloatArray
+
+    @classmethod
+    def together(cls, parts: Iterable[FrameCandidates]) -> FrameCandidates:
+        """Concatenate several sets of candidates."""
+        return cls(*map(np.concatenate, zip(*parts, strict=True)))
+
+    def only(self, kept: IntArray | BoolArray) -> FrameCandidates:
+        """Select some candidates."""
+        return FrameCandidates(*(part[kept] for part in self))
 
 
 class FrameFilter:
@@ -66,12 +74,11 @@ class FrameFilter:
         light = np.where(used, level_e**2 / (level_e + read_e2), 0.0)
         self._share = np.where(used, level_e / (level_e + read_e2), 0.0).astype(np.float32)
         images = templates.images
-        half = images.shape[1] // 2
-        self._half = half
+        self._half = half = images.shape[1] // 2
         # what wraps around falls on the first rows and columns, which are cut off
         self._padded = [next_fast_len(n + half, real=True) for n in level_e.shape]
-        flipped = images[:, ::-1, ::-1]
         self._layers = np.flatnonzero((polarity == 0) | (templates.signs == polarity))
+        flipped = images[:, ::-1, ::-1]
         norm = self._cut(rfft2(light, self._padded) * rfft2(flipped**2, self._padded))
         norm = np.sqrt(np.maximum(norm, 1e-9 * norm.max()))
         self._norm = norm[self._layers].astype(np.float32)
@@ -92,93 +99,69 @@ class FrameFilter:
 
         Shapes: `residual_e` (n, y, x), `power` (n,), `known` (k, 3).
         """
-        parts: list[FloatArray] = []
-        threshold = self._templates.threshold
-        fields_at_once = max(32 // len(self._layers), 1)
-        for start in range(0, len(residual_e), fields_at_once):
-            stop = start + fields_at_once
-            snr = self._snr(residual_e[start:stop], power[start:stop])
-            best = snr.max(axis=1)
-            at = maxima(best, SAMPLED * threshold, (0, 1, 1))
-            frame, row, column = at.T
-            layer = snr[frame, :, row, column].argmax(axis=1)
-            field = frame * len(self._layers) + layer
-            dy, dx, above = summits(
-                snr.reshape(-1, *snr.shape[2:]), np.stack([field, row, column], 1)
-            )
-            height = best[frame, row, column] + above
-            order = np.lexsort((-column, -row, -layer, -height, frame))
-            order = order[height[order] > threshold]
-            tops = np.stack([frame + start, height, column + dx, row + dy])[:, order]
-            kept = self._alone(tops[0], tops[1], tops[2], tops[3], known)
-            at, layer = at[order][kept], layer[order][kept]
-            frames, heights, x, y = tops[:, kept]
-            norm = self._norm[layer, at[:, 1], at[:, 2]]
-            strength = heights / (np.sqrt(power[frames.astype(np.int64)]) * norm)
-            z = self._templates.z_nm[self._layers[layer]]
-            parts.append(np.stack([first + frames, x, y, z, strength, heights]))
-        frames, *others = np.concatenate(parts, axis=1)
-        return FrameCandidates(frames.astype(np.int64), *others)
+        at_once = max(32 // len(self._layers), 1)
+        parts = []
+        for start in range(0, len(residual_e), at_once):
+            here = slice(start, start + at_once)
+            tops = self._peaks(residual_e[here], power[here])
+            tops = tops.only(self._alone(tops, known[here]))
+            parts.append(tops._replace(frame=tops.frame + first + start))
+        return FrameCandidates.together(parts)
 
-    def _alone(
-        self,
-        frame: FloatArray,
-        height: FloatArray,
-        x: FloatArray,
-        y: FloatArray,
-        known: list[FloatArray],
-    ) -> BoolArray:
+    def _peaks(self, residual_e: NDArray[np.float32], power: FloatArray) -> FrameCandidates:
+        """Find the peaks above the threshold, the highest of each frame first."""
+        threshold = self._templates.threshold
+        spectrum = rfft2(residual_e * self._share, self._padded)[:, None]
+        noise = np.sqrt(power).astype(np.float32)[:, None, None, None] * self._norm
+        snr = self._cut(spectrum * self._duals) / noise
+        best = snr.max(axis=1)
+        frame, row, column = maxima(best, SAMPLED * threshold, (0, 1, 1)).T
+        layer = snr[frame, :, row, column].argmax(axis=1)
+        at = np.stack([frame * len(self._layers) + layer, row, column], axis=1)
+        dy, dx, above = summits(snr.reshape(-1, *snr.shape[2:]), at)
+        height = best[frame, row, column] + above
+        strength = height / (np.sqrt(power[frame]) * self._norm[layer, row, column])
+        z_nm = self._templates.z_nm[self._layers[layer]]
+        order = np.lexsort((-column, -row, -layer, -height, frame))
+        order = order[height[order] > threshold]
+        return FrameCandidates(frame, column + dx, row + dy, z_nm, strength, height).only(order)
+
+    def _alone(self, tops: FrameCandidates, known: list[FloatArray]) -> BoolArray:
         """Tell which peaks are neither side lobes nor residues.
 
         The highest peaks of each frame come first.  In each round the highest remaining peak of
         every frame is accepted and its side lobes are removed.
         """
-        kept = np.zeros(len(frame), dtype=bool)
-        sure = ~self._are_left_over(frame.astype(np.int64), height, x, y, known)
-        left = np.arange(len(frame))
+        kept, left = np.zeros(len(tops.frame), dtype=bool), np.arange(len(tops.frame))
+        sure = ~self._are_left_over(tops, known)
         while left.size:
-            begins = np.diff(frame[left], prepend=-1) > 0
-            tops = left[begins]
-            kept[tops] = sure[tops]
-            top = tops[np.cumsum(begins) - 1]
-            hides = sure[top] & self._is_lobe(height, x, y, left, top)
+            begins = np.diff(tops.frame[left], prepend=-1) > 0
+            accepted = left[begins]
+            kept[accepted] = sure[accepted]
+            top = accepted[np.cumsum(begins) - 1]
+            hides = sure[top] & self._is_lobe(tops.only(left), tops.only(top))
             left = left[~(begins | hides)]
         return kept
 
-    def _is_lobe(
-        self, height: FloatArray, x: FloatArray, y: FloatArray, one: IntArray, other: IntArray
-    ) -> BoolArray:
+    def _is_lobe(self, one: FrameCandidates, other: FrameCandidates) -> BoolArray:
         """Tell which peaks may be side lobes of higher ones."""
-        apart_x, apart_y = x[one] - x[other], y[one] - y[other]
+        apart_x, apart_y = one.x_px - other.x_px, one.y_px - other.y_px
         within_region = np.maximum(np.abs(apart_x), np.abs(apart_y)) < self._roi_px
-        lobe = height[one] < height[other] * np.where(within_region, self._lobe, FAR_LOBE)
+        lobe = one.snr < other.snr * np.where(within_region, self._lobe, FAR_LOBE)
         lobe |= np.hypot(apart_x, apart_y) < NEAR * self._roi_px
         return np.asarray(lobe | within_region if self._cautious else lobe)
 
-    def _are_left_over(
-        self,
-        frame: IntArray,
-        height: FloatArray,
-        x: FloatArray,
-        y: FloatArray,
-        known: list[FloatArray],
-    ) -> BoolArray:
+    def _are_left_over(self, tops: FrameCandidates, known: list[FloatArray]) -> BoolArray:
         """Tell which peaks may be residues of particles that were fitted already."""
         places = np.full((len(known), max(map(len, known)), 3), np.nan)
         for row, there in zip(places, known, strict=True):
             row[: len(there)] = there
-        known_x, known_y, known_height = np.moveaxis(places[frame], 2, 0)
-        away = np.hypot(known_x - x[:, None], known_y - y[:, None])
+        known_x, known_y, known_height = np.moveaxis(places[tops.frame], 2, 0)
+        away = np.hypot(known_x - tops.x_px[:, None], known_y - tops.y_px[:, None])
         if self._cautious:
             return np.asarray((away < self._roi_px).any(axis=1))
-        over = (away < NEAR * self._roi_px) & (height[:, None] < LEFT_OVER * known_height)
+        over = (away < NEAR * self._roi_px) & (tops.snr[:, None] < LEFT_OVER * known_height)
         return np.asarray(over.any(axis=1))
-
-    def _snr(self, residual_e: NDArray[np.float32], power: FloatArray) -> NDArray[np.float32]:
-        """Give the signal-to-noise ratio of each template at each pixel, shape (n, k, y, x)."""
-        spectrum = rfft2(residual_e * self._share, self._padded)[:, None]
-        noise = np.sqrt(power).astype(np.float32)[:, None, None, None] * self._norm
-        return np.asarray(self._cut(spectrum * self._duals) / noise)
 
     def _cut(self, spectrum: NDArray[Any]) -> NDArray[Any]:
         """Transform back and crop to the field."""
@@ -218,34 +201,24 @@ def search_frames(
     side = context.roi_px
     if context.mode == "joint":
         side += round(2 * RING_SLOPE * context.config.fit.z_range_nm[1] / field.pixel_nm)
-    search = FrameFilter(
-        context.templates, ground.level, field.read_e2, field.used,
-        polarity=context.config.detection.sign, roi_px=side, cautious=cautious,
-    )  # fmt: skip
+    sign, light = context.config.detection.sign, (ground.level, field.read_e2, field.used)
+    search = FrameFilter(context.templates, *light, polarity=sign, roi_px=side, cautious=cautious)
     if frames is None:
         field.draw(ground, rows)
     starts = rows.starts(field.frames)
-    pixel = field.pixel_nm
-    places = np.column_stack([rows.theta[:, :2] / pixel, rows.snr])
+    places = np.column_stack([rows.theta[:, :2] / field.pixel_nm, rows.snr])
+    begin, end = frames or (0, field.frames)
 
     def block(first: int) -> FrameCandidates:
         last = min(first + _BLOCK, end)
         known = [places[starts[t] : starts[t + 1]] for t in range(first, last)]
-        return search.find(
-            field.residual(ground, rows, first, last), ground.power[first:last], first, known
-        )
+        left = field.residual(ground, rows, first, last)
+        return search.find(left, ground.power[first:last], first, known)
 
-    begin, end = frames or (0, field.frames)
-    blocks = list(range(begin, end, _BLOCK))
+    blocks = range(begin, end, _BLOCK)
     sample = blocks[:: _SAMPLED if enough else 1]
     parts = dict(zip(sample, pool.map(block, sample), strict=True))
     if sum(len(part.frame) for part in parts.values()) > enough / _SAMPLED:
         others = [first for first in blocks if first not in parts]
         parts |= zip(others, pool.map(block, others), strict=True)
-    found = [parts[first] for first in sorted(parts)]
-    return FrameCandidates(
-        *(
-            np.concatenate([getattr(part, name) for part in found])
-            for name in ("frame", "x_px", "y_px", "z_nm", "strength", "snr")
-        )
-    )
+    return FrameCandidates.together(parts[first] for first in sorted(parts))

@@ -124,7 +124,7 @@ def _steps_of(fits: pd.DataFrame, ticks: IntArray | None) -> _Steps | None:
     good = good.sort_values(["track", "frame"])
     time = good["frame"] if ticks is None else ticks[good["frame"].to_numpy(int)]
     step = good.assign(time=time).diff()
-    next_ = (step[["track", "time"]] == (0, 1)).all(axis=1) & (step["frame"] == 1)
+    next_ = (step["track"] == 0) & (step["time"] == 1) & (step["frame"] == 1)
     steps = good[["track", "frame"]].assign(x=step["x_nm"], y=step["y_nm"])[next_]
     of_track = (steps["x"] ** 2 + steps["y"] ** 2).groupby(steps["track"])
     steps["variance"] = of_track.transform("median") / (2 * math.log(2))

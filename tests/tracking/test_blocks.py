@@ -24,6 +24,7 @@ from iscat_analysis.calibration import with_standards
 from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.run import RESUMPTION_HINT, partial_folder
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline import analyse, fit_stack
@@ -108,7 +109,9 @@ def _plan(counts: np.ndarray, **sections: Any) -> Plan:
     for name, changes in sections.items():
         part = getattr(config, name).model_copy(update=changes)
         config = config.model_copy(update={name: part})
-    return plan_blocks(Stack(counts), config, Camera(gain_e_per_adu=GAIN), check=_unchecked)
+    stack, camera = Stack(counts), Camera(gain_e_per_adu=GAIN)
+    span = fitted_frames(stack, config)
+    return plan_blocks(stack, config, camera, check=_unchecked, span=span)
 
 
 def test_a_block_ends_where_drift_costs_more_than_counting() -> None:
