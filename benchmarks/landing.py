@@ -34,7 +34,7 @@ from _memory import Memory
 from _peer import peer_python
 
 from iscat_analysis._kernels.sliding import contrast_map
-from iscat_analysis.camera import Camera, find_defects
+from iscat_analysis.camera import Camera
 from iscat_analysis.config import load_config
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.search.frames import make_chunk, measure_frames
@@ -143,7 +143,7 @@ def sliding_ratio(frames: int, side: int, peer: Path | None) -> dict[str, float 
             light, repeats = measure_frames(counts, camera, mapper=pool.map)
             return make_chunk(
                 0, counts, ~repeats, light, camera,
-                stride=WINDOW // 4, defects=find_defects, mapper=pool.map,
+                stride=WINDOW // 4, mapper=pool.map,
             )  # fmt: skip
 
         def ratio_only() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.sliding import block_sums
-from iscat_analysis.camera import Camera, check_counts, find_defects, sampled
+from iscat_analysis.camera import Camera, check_counts, sampled
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, Mapper
@@ -239,10 +239,8 @@ class Reader:
         if self._summed is not None and self._summed[:2] == (span, stride):
             return self._summed[2]
         good, light = self._lit(span, pool)
-        chunk = make_chunk(
-            span[0], self._frames(*span), good, light, self.camera,
-            stride=stride, defects=find_defects, mapper=pool.map, check=self._check,
-        )  # fmt: skip
+        frames = span[0], self._frames(*span), good, light, self.camera
+        chunk = make_chunk(*frames, stride=stride, mapper=pool.map, check=self._check)
         self._summed = span, stride, chunk
         return chunk
 
@@ -266,7 +264,9 @@ class Reader:
             for _ in pool.map(add, bands, repeat(frames), repeat(lit)):
                 pass
             self._let_go()
-        return sums_of(span, good, light, total, highest, self.camera, find_defects)
+        dark = np.count_nonzero(good) * np.asarray(self.camera.offset_adu)
+        electrons = self.camera.gain_e_per_adu * (total - dark)
+        return sums_of(span, good, light, electrons, highest, self.camera)
 
     def tile_chunk(
         self, sums: FieldSums, tile: Tile, stride: int, pool: ThreadPoolExecutor
@@ -275,9 +275,14 @@ class Reader:
         if not self._placed:
             self._hold(*sums.span, pool.map)
         return make_tile_chunk(
-            self._stored(*sums.span, tile.here), sums, self.camera.part(tile.here),
-            stride=stride, check=self._check, let_go=self._let_go, mapper=pool.map,
-        )  # fmt: skip
+            self._stored(*sums.span, tile.here),
+            sums,
+            self.camera.part(tile.here),
+            stride=stride,
+            check=self._check,
+            let_go=self._let_go,
+            mapper=pool.map,
+        )
 
     def _lit(self, span: tuple[int, int], pool: ThreadPoolExecutor) -> tuple[BoolArray, FloatArray]:
         """Tell which frames of a span are good, and their light; refused where none is."""
@@ -360,17 +365,16 @@ def plan_parts(
     where they are made in place.
     """
     first, last = stretch or (reader.first, reader.last)
-    stride = stride_of(window)
-    plan = plan_chunks(reader, config, window, (first, last))
-    if plan:
-        return [[Part(core, span)] for core, span in plan]
-    parts, core = choose_tiles(reader, config, window, last - first, in_place=in_place)
-    tiles = cut_field(reader.shape, parts, halo_px(config))
+    stride, halo = stride_of(window), halo_frames(window)
+    core = plan_chunks(reader, config, window, last - first)
+    tiles: Sequence[Tile | None] = [None]
+    if not core:
+        parts, core = choose_tiles(reader, config, window, last - first, in_place=in_place)
+        tiles = cut_field(reader.shape, parts, halo_px(config))
     count = math.ceil((last - first) / core)
     even = math.ceil((last - first) / count / stride) * stride
-    halo = halo_frames(window)
     # tiles of a movie, or some more, tell enough of the noise where nothing lands
-    every = max(1, count * len(tiles) // 16)
+    every = max(1, count * len(tiles) // 16) if tiles[0] else 1
     return [
         [
             Part(
@@ -453,34 +457,18 @@ def _moving_bytes(config: Config) -> int:
     return 12 if config.background.follows_pattern else 0
 
 
-def plan_chunks(
-    reader: Reader, config: Config, window: int, stretch: tuple[int, int] | None = None
-) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Divide a movie, or a stretch of it, whose field is not divided; empty where it has to be."""
-    first, last = stretch or (reader.first, reader.last)
+def plan_chunks(reader: Reader, config: Config, window: int, frames: int) -> int:
+    """Give the frames of a core where the field is not divided; 0 where it has to be."""
     halo, stride = halo_frames(window), stride_of(window)
-    budget = counts_budget(config)
     # beside counts and blocks, the field holds some images in doubles
     pixels = math.prod(reader.shape)
+    budget = counts_budget(config) - 40 * pixels
     per_block = _SUM_BYTES + _MAP_BYTES + _HIGHEST_BYTES + _moving_bytes(config)
     buffers_bytes = per_block * pixels // stride
-    if (last - first) * (reader.frame_bytes + buffers_bytes) <= budget - 40 * pixels:
-        return [((first, last), (first, last))]
-    room = (budget - 40 * pixels) // (reader.held_bytes + buffers_bytes)
-    core = (room - 2 * halo) // stride * stride
-    if core < max(halo, stride):  # most of the work would be that of halos
-        return []
-    count = 2 * math.ceil((last - first) / core / 2)  # an even number
-    even = (last - first) / count
-    # two that are held at once have the room of two
-    # than others, of a chunk that is summed before they are begun
-    longer = math.ceil(min(1.24 * even, 2 * core - even) / stride) * stride
-    rest = math.ceil((last - first - longer) / (count - 1) / stride) * stride
-    edges = [first, *range(first + longer, last, rest), last]
-    return [
-        ((begin, end), (max(begin - halo, first), min(end + halo, last)))
-        for begin, end in pairwise(edges)
-    ]
+    if frames * (reader.frame_bytes + buffers_bytes) <= budget:
+        return frames
+    core = (budget // (reader.held_bytes + buffers_bytes) - 2 * halo) // stride * stride
+    return core if core >= max(halo, stride) else 0  # else most of the work would be that of halos
 
 
 def sum_first_chunk(reader: Reader, config: Config, window: int) -> None:

@@ -18,12 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.sliding import block_sums, frame_totals, part_sums, region_sum
-from iscat_analysis.camera import Camera
+from iscat_analysis.camera import Camera, find_defects
 from iscat_analysis.last_used import LastUsed
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, InPlace, Mapper, PlacedSource
 
 Box = tuple[slice, slice]
 """Rows and columns."""
+
+FloatLike = float | FloatArray
 
 EVERYWHERE: Box = (slice(None), slice(None))
 """All pixels."""
@@ -39,13 +41,15 @@ def middle_of_box(box: Box, shape: tuple[int, int], side_px: int) -> Box:
     return rows, columns
 
 
-def is_within(box: Box, y_px: float, x_px: float, margin_px: float) -> bool:
-    """Whether a place is in a box of pixels, or nearer to it than a margin."""
-    return all(
-        (part.start is None or place >= part.start - 0.5 - margin_px)
-        and (part.stop is None or place < part.stop - 0.5 + margin_px)
-        for place, part in zip((y_px, x_px), box, strict=True)
-    )
+def is_within(box: Box, y_px: FloatLike, x_px: FloatLike, margin_px: float = 0.0) -> BoolArray:
+    """Tell which places are in a box of pixels, or nearer to it than a margin."""
+    kept = np.ones(np.shape(y_px), dtype=np.bool_)
+    for place, part in zip((y_px, x_px), box, strict=True):
+        if part.start is not None:
+            kept &= place >= part.start - 0.5 - margin_px
+        if part.stop is not None:
+            kept &= place < part.stop - 0.5 + margin_px
+    return kept
 
 
 @dataclass(frozen=True)
@@ -71,12 +75,14 @@ class Tile:
     @property
     def inner(self) -> Box:
         """Index of the core in the tile; without an end where the field ends."""
+        return self._core_from(self.corner)
+
+    def _core_from(self, corner: tuple[int, int]) -> Box:
+        """Core whose pixels count from a corner; without an end where the field ends."""
+        spans = zip((self.core_rows, self.core_columns), corner, self.field, strict=True)
         rows, columns = (
-            slice(low - first if low > first else None, high - first if high < last else None)
-            for (low, high), (first, last) in (
-                (self.core_rows, self.rows),
-                (self.core_columns, self.columns),
-            )
+            slice(low - first if low > 0 else None, high - first if high < size else None)
+            for (low, high), first, size in spans
         )
         return rows, columns
 
@@ -99,45 +105,37 @@ class Tile:
     @property
     def is_central(self) -> bool:
         """Whether its core holds the middle of the field."""
-        y, x = (np.array((n - 1) / 2) for n in self.field)
+        y, x = ((n - 1) / 2 for n in self.field)
         return bool(self.holds(y, x))
 
-    def holds(self, y_px: FloatArray, x_px: FloatArray, margin_px: float = 0.0) -> BoolArray:
+    def holds(self, y_px: FloatLike, x_px: FloatLike, margin_px: float = 0.0) -> BoolArray:
         """Tell which places of the field are in the core; beyond the edge of the field it goes on.
 
         Shapes: `y_px, x_px` (n,), result (n,).
         """
-        kept = np.ones(np.shape(y_px), dtype=np.bool_)
-        for place, (low, high), size in zip(
-            (y_px, x_px), (self.core_rows, self.core_columns), self.field, strict=True
-        ):
-            if low > 0:
-                kept &= place >= low - 0.5 - margin_px
-            if high < size:
-                kept &= place < high - 0.5 + margin_px
-        return kept
+        return is_within(self._core_from((0, 0)), y_px, x_px, margin_px)
 
 
 def cut_field(shape: tuple[int, int], parts: tuple[int, int], halo_px: int) -> list[Tile]:
     """Cut a field into so many rows and columns of tiles."""
-    edges = [
-        np.linspace(0, size, number + 1).round().astype(int).tolist()
-        for size, number in zip(shape, parts, strict=True)
+
+    def ranges(size: int, number: int) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+        edges = np.linspace(0, size, number + 1).round().astype(int).tolist()
+        cores = pairwise(edges)
+        return [((a, b), (max(a - halo_px, 0), min(b + halo_px, size))) for a, b in cores]
+
+    return [
+        Tile(core_rows, core_columns, rows, columns, shape)
+        for core_rows, rows in ranges(shape[0], parts[0])
+        for core_columns, columns in ranges(shape[1], parts[1])
     ]
-    tiles = []
-    for core_rows in pairwise(edges[0]):
-        for core_columns in pairwise(edges[1]):
-            rows, columns = (
-                (max(low - halo_px, 0), min(high + halo_px, size))
-                for (low, high), size in zip((core_rows, core_columns), shape, strict=True)
-            )
-            tiles.append(Tile(core_rows, core_columns, rows, columns, shape))
-    return tiles
 
 
 @dataclass(frozen=True)
 class FieldSums:
     """What some frames say of the whole field, or of a tile: made once for all of its tiles.
+
+    The mean light of a pixel and frame, `level_e`, is always that of the whole field.
 
     Shapes: `good, power` (t,), the others (y, x).
     """
@@ -279,24 +277,22 @@ _COPIED = 256  # frames of a region that are copied together from a file
 
 
 @dataclass(frozen=True)
-class Chunk:
-    """Consecutive frames in memory, with their power."""
+class Chunk(FieldSums):
+    """Consecutive frames in memory, with their power and their sums in blocks."""
 
-    first: int
     counts: StoredFrames
-    good: BoolArray
-    power: FloatArray
     camera: Camera
-    mean_e: FloatArray
-    usable: BoolArray
-    saturated: BoolArray
     edges: NDArray[np.int64]
     blocks_e: NDArray[np.float32]  # a millionth of their noise is lost
     check: Callable[[], None]
     let_go: Callable[[], None]  # of pages of the file, once a region was copied
-    level_e: float  # mean light of a pixel and frame, of the whole field
     lends_blocks: bool  # whether maps may take their memory: nobody else asks for this chunk
     _regions: HeldRegions = field(init=False, repr=False, default_factory=HeldRegions)
+
+    @property
+    def first(self) -> int:
+        """Number of the first frame."""
+        return self.span[0]
 
     @property
     def stop(self) -> int:
@@ -342,10 +338,8 @@ class Chunk:
         rows, columns = (part.indices(n) for part, n in zip(box, self.shape, strict=True))
         sums = np.zeros((rows[1] - rows[0], columns[1] - columns[0]))
         good = self.good[frames]
-        block_sums(
-            counts, (top + rows[0], left + columns[0]), good,
-            row_of_sums(counts.dtype, sums.shape[1]), sums, np.empty((0, 0), dtype=counts.dtype),
-        )  # fmt: skip
+        row, nothing = row_of_sums(counts.dtype, sums.shape[1]), np.empty((0, 0), counts.dtype)
+        block_sums(counts, (top + rows[0], left + columns[0]), good, row, sums, nothing)
         self.let_go()
         dark = np.count_nonzero(good) * _at(self.camera.offset_adu, box)
         return np.asarray(_at(self.camera.gain_e_per_adu, box) * (sums - dark))
@@ -385,10 +379,8 @@ class Patch:
     def frames(self, start: int, stop: int) -> Patch:
         """Select some of the frames, without a copy."""
         here = slice(max(start - self.first, 0), max(stop - self.first, 0))
-        return replace(
-            self, first=self.first + here.start, counts=self.counts[here], good=self.good[here],
-            power=self.power[here],
-        )  # fmt: skip
+        parts = {"counts": self.counts[here], "good": self.good[here], "power": self.power[here]}
+        return replace(self, first=self.first + here.start, **parts)
 
     def window(self, start: int, stop: int) -> tuple[FloatArray, int, float]:
         """Sum frames.
@@ -418,15 +410,11 @@ class Patch:
 
     def part(self, rows: slice, columns: slice) -> Patch:
         """Copy some of its pixels, which count from its own first one."""
-        here = rows, columns
+        here, frames = (rows, columns), slice(0, len(self.counts))
+        ends = (rows.start, rows.stop), (columns.start, columns.stop)
         return replace(
             self,
-            counts=_region(
-                StoredFrames([self.counts]),
-                slice(0, len(self.counts)),
-                (rows.start, rows.stop),
-                (columns.start, columns.stop),
-            ),
+            counts=_region(StoredFrames([self.counts]), frames, *ends),
             gain=_at(self.gain, here),
             offset=_at(self.offset, here),
             read_noise_e=_at(self.read_noise_e, here),
@@ -538,52 +526,28 @@ def make_chunk(
     camera: Camera,
     *,
     stride: int,
-    defects: Callable[[FloatArray, FloatArray], BoolArray],
-    check: Callable[[], None] = lambda: None,
     mapper: Mapper = map,
+    check: Callable[[], None] = lambda: None,
 ) -> Chunk:
     """Sum consecutive frames in blocks.
 
     Shapes: `counts` (t, y, x), `good` (t,), `light_e` (t,).
     """
-    stored = StoredFrames([counts])
+    stored, span = StoredFrames([counts]), (first, first + len(counts))
     edges, blocks, highest = _sum_blocks(stored, good, camera, stride, check, mapper, highest=True)
-    sums = _judged(
-        (first, first + len(counts)), good, light_e, blocks.sum(axis=0, dtype=np.float64),
-        highest.max(axis=0), camera, defects,
-    )  # fmt: skip
-    return Chunk(
-        first, stored, good, sums.power, camera, sums.mean_e, sums.usable, sums.saturated,
-        edges, blocks, check, _nothing, sums.level_e, lends_blocks=False,
-    )  # fmt: skip
+    electrons = blocks.sum(axis=0, dtype=np.float64)
+    sums = sums_of(span, good, light_e, electrons, highest.max(axis=0), camera)
+    frames = {"counts": stored, "camera": camera, "edges": edges, "blocks_e": blocks}
+    return Chunk(**vars(sums), **frames, check=check, let_go=_nothing, lends_blocks=False)
 
 
 def sums_of(
     span: tuple[int, int],
     good: BoolArray,
     light_e: FloatArray,
-    total: FloatArray,
-    highest: NDArray[Any],
-    camera: Camera,
-    defects: Callable[[FloatArray, FloatArray], BoolArray],
-) -> FieldSums:
-    """Say which light and which pixels some frames have.
-
-    Shapes: `good, light_e` (t,), `total, highest` (y, x), in counts.
-    """
-    dark = np.count_nonzero(good) * np.asarray(camera.offset_adu)
-    electrons = camera.gain_e_per_adu * (total - dark)
-    return _judged(span, good, light_e, electrons, highest, camera, defects)
-
-
-def _judged(
-    span: tuple[int, int],
-    good: BoolArray,
-    light_e: FloatArray,
     electrons: FloatArray,
     highest: NDArray[Any],
     camera: Camera,
-    defects: Callable[[FloatArray, FloatArray], BoolArray],
 ) -> FieldSums:
     """Say which light frames have, and which pixels of their sum can be used.
 
@@ -593,7 +557,7 @@ def _judged(
     power /= power[good].mean()
     saturated = camera.saturated(highest)
     variance = camera.read_variance_e2((electrons.shape[0], electrons.shape[1]))
-    defective = defects(electrons, np.count_nonzero(good) * variance)
+    defective = find_defects(electrons, np.count_nonzero(good) * variance)
     usable = ~(saturated | defective) & (electrons > 0)
     mean = electrons / power.sum()
     return FieldSums(span, good, power, float(mean.mean()), mean, usable, saturated)
@@ -622,10 +586,8 @@ def make_tile_chunk(
         counts, sums.good, camera, stride, check_and_let_go, mapper, highest=False
     )
     let_go()
-    return Chunk(
-        sums.span[0], counts, sums.good, sums.power, camera, sums.mean_e, sums.usable,
-        sums.saturated, edges, blocks, check, let_go, sums.level_e, lends_blocks=True,
-    )  # fmt: skip
+    frames = {"counts": counts, "camera": camera, "edges": edges, "blocks_e": blocks}
+    return Chunk(**vars(sums), **frames, check=check, let_go=let_go, lends_blocks=True)
 
 
 def _nothing() -> None:

@@ -12,7 +12,6 @@ from iscat_analysis.camera import (
     Mover,
     Trajectory,
     derivatives,
-    find_defects,
     follow_pattern,
     measure_drift,
     trusted,
@@ -51,7 +50,7 @@ def _chunk(config: Config, seed: int, jump: int = 0) -> Chunk:
         counts[len(counts) // 2 :] = np.roll(counts[len(counts) // 2 :], jump, axis=2)
     light, repeats = measure_frames(counts, Camera())
     return make_chunk(
-        0, counts, ~repeats, light, Camera(), stride=STRIDE, defects=find_defects
+        0, counts, ~repeats, light, Camera(), stride=STRIDE
     )  # fmt: skip
 
 
@@ -222,7 +221,7 @@ def _two_patterns(moved_px: float, seed: int, frames: int = 440, level_e: float 
     )
     light, repeats = measure_frames(counts, Camera())
     return make_chunk(
-        0, counts, ~repeats, light, Camera(), stride=STRIDE, defects=find_defects
+        0, counts, ~repeats, light, Camera(), stride=STRIDE
     )  # fmt: skip
 
 

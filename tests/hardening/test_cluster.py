@@ -228,7 +228,7 @@ def test_tiles_of_a_field_give_the_same_bytes(
     cluster: Workers, landing: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two tiles of each of two chunks are jobs; the sums over the field are made once for both."""
-    monkeypatch.setattr(planning, "plan_chunks", lambda *_: [])
+    monkeypatch.setattr(planning, "plan_chunks", lambda *_: 0)
     monkeypatch.setattr(planning, "choose_tiles", lambda *_, **__: ((1, 2), FRAMES // 2))
     cluster.add(2)
     config = ia.configure(LANDING)

@@ -487,15 +487,14 @@ def test_windows_that_do_not_fit_into_memory() -> None:
 
 
 @pytest.mark.parametrize(
-    ("frames", "cores"),
-    [(150, [150]), (280, [80, 70, 70, 60]), (301, [65, *[50] * 4, 36]), (600, [75] * 8)],
+    ("frames", "cores"), [(150, [150]), (280, [70] * 4), (301, [*[65] * 4, 41]), (600, [75] * 8)]
 )
 def test_chunks_follow_one_another_and_fit_into_memory(frames: int, cores: list[int]) -> None:
-    """The first is longer where that and the next have room for 2 × 75 frames beside windows."""
+    """There is room for 75 frames beside windows."""
     config = _config("compute.memory_limit_mb=136", "background.window_frames=20")
     movie = Memory(np.zeros((frames, 256, 256), dtype="u2"))
     reader = chunks_module.reader_of(movie, config, Camera(), (0, frames))
-    plan = planning.plan_chunks(reader, config, 20)
+    plan = [(part.core, part.span) for (part,) in planning.plan_parts(reader, config, 20)]
     edges = np.cumsum([0, *cores]).tolist()
     assert plan == [
         ((begin, end), (max(begin - 40, 0), min(end + 40, frames)))

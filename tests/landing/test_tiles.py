@@ -59,7 +59,7 @@ def _run(movie: Any) -> Any:
 
 
 def _tiled(monkeypatch: pytest.MonkeyPatch, parts: tuple[int, int], core: int) -> None:
-    monkeypatch.setattr(planning, "plan_chunks", lambda *_: [])
+    monkeypatch.setattr(planning, "plan_chunks", lambda *_: 0)
     monkeypatch.setattr(planning, "choose_tiles", lambda *_, **__: (parts, core))
 
 

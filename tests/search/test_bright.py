@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from iscat_analysis._kernels.sliding import step_energy
-from iscat_analysis.camera import Camera, find_defects
+from iscat_analysis.camera import Camera
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.bright import BrightStep, find_bright_steps
 from iscat_analysis.search.frames import Chunk, make_chunk, measure_frames
@@ -41,9 +41,7 @@ def _steps(events: list[tuple[int, float, float, float]], seed: int) -> tuple[Br
 def _chunk(counts: np.ndarray) -> Chunk:  # type: ignore[type-arg]
     camera = Camera(full_scale_adu=65535.0)
     light, repeats = measure_frames(counts, camera)
-    return make_chunk(
-        0, counts, ~repeats, light, camera, stride=WINDOW // STRIDES, defects=find_defects
-    )
+    return make_chunk(0, counts, ~repeats, light, camera, stride=WINDOW // STRIDES)
 
 
 def test_steps_are_found_at_their_place_and_frame() -> None:

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.sliding import strongest_maps
-from iscat_analysis.camera import Camera, find_defects
+from iscat_analysis.camera import Camera
 from iscat_analysis.search.dating import crosstalk, locate_step
 from iscat_analysis.search.frames import (
     Chunk,
@@ -56,9 +56,7 @@ def _chunk(
     camera = camera or Camera()
     light, repeats = measure_frames(counts, camera)
     good = np.isfinite(light) & ~repeats
-    return make_chunk(
-        bad.get("first", 0), counts, good, light, camera, stride=stride, defects=find_defects
-    )
+    return make_chunk(bad.get("first", 0), counts, good, light, camera, stride=stride)
 
 
 # ---- sums ------------------------------------------------------------------------------------
