@@ -10,7 +10,7 @@ From the contrasts of standards to the line.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, pairwise
@@ -24,6 +24,7 @@ from scipy.special import chdtrc, ndtr
 
 from iscat_analysis.calibration.line import ContrastPeak, Landing, MassCalibration
 from iscat_analysis.errors import ConfigError, DataError, SignError
+from iscat_analysis.findings import existing
 from iscat_analysis.findings.tables import STANDARDS_SCATTER, TWO_STANDARDS
 from iscat_analysis.records import FloatArray
 from iscat_analysis.units import count
@@ -71,13 +72,6 @@ def york_line(x: ArrayLike, x_se: ArrayLike, y: ArrayLike, y_se: ArrayLike) -> S
     return StraightLine(slope, intercept, covariance, chi2, xs.size - 2)
 
 
-_PROMINENCE_SIGMAS = 3.0
-_MOST_PEAKS = 10
-_CORE_SIGMAS = 2.5  # half-width of the fitted core of a peak: its tails contain other events
-_WINDOWS = 8
-_LEAST_IN_PEAK = 5
-_GRID = 4096
-_KERNEL_REACH = 6.0  # standard deviations
 _ROOT_2PI = math.sqrt(2 * math.pi)
 
 
@@ -99,31 +93,28 @@ def find_contrast_peaks(
     if (sigma > 0).any():  # no peak is narrower
         h = min(h, 0.6 * float(np.median(sigma)))
     h /= detail
-    grid, step = np.linspace(0.0, float(x.max()) + 4 * h, _GRID, retstep=True)
-    edges = np.concatenate([grid - step / 2, [grid[-1] + step / 2]])
-    counts = np.histogram(x, edges)[0]
-    density = gaussian_filter1d(counts / step, h / step, mode="constant", truncate=_KERNEL_REACH)
-    from scipy.signal import find_peaks  # takes as long to load as NumPy, pandas and this package
+    grid, step = np.linspace(0.0, float(x.max()) + 4 * h, 4096, retstep=True)
+    counts = np.histogram(x, np.append(grid - step / 2, grid[-1] + step / 2))[0]
+    density = gaussian_filter1d(counts / step, h / step, mode="constant", truncate=6.0)
+    # takes as long to load as NumPy, pandas and this package
+    from scipy.signal import find_peaks, peak_widths
 
     found, about = find_peaks(density, prominence=0)
     # Var Σφ_h(x − x_i) = n·f/(2√π h) for Poisson events.
     noise = np.sqrt(density[found] / (2 * math.sqrt(math.pi) * h))
-    stands = about["prominences"] > _PROMINENCE_SIGMAS * noise
-    found = found[stands]
-    valleys = [0.0]
-    for left, right in pairwise(found):
-        valleys.append(float(grid[left + int(np.argmin(density[left:right]))]))
-    valleys.append(float(grid[-1]))
+    found = found[about["prominences"] > 3.0 * noise]
+    lowest = [left + int(np.argmin(density[left:right])) for left, right in pairwise(found)]
+    valleys = grid[[0, *lowest, -1]].tolist()
+    # one standard deviation from a normal mode the density has fallen to exp(−1/2) of it
+    whole = density[found], np.zeros_like(found), np.full_like(found, len(grid) - 1)
+    halves = peak_widths(density, found, 1 - math.exp(-0.5), prominence_data=whole)[0] * step / 2
     peaks = []
-    for number, place in enumerate(found):
-        centre, top = float(grid[place]), float(density[place])
-        half = _half_width(grid, density, int(place), 0.6065 * top)
+    for centre, half, limits in zip(grid[found], halves, pairwise(valleys), strict=False):
         width = math.sqrt(max(half**2 - h**2, (0.3 * half) ** 2))
-        limits = valleys[number], valleys[number + 1]
-        peak = _settled_peak(x, sigma, limits, centre, width)
+        peak = _settled_peak(x, sigma, limits, float(centre), width)
         if peak is not None:
             peaks.append(peak)
-    peaks = sorted(peaks, key=lambda peak: -peak.count)[:_MOST_PEAKS]
+    peaks = sorted(peaks, key=lambda peak: -peak.count)[:10]
     return sorted(peaks, key=lambda peak: peak.contrast)
 
 
@@ -133,11 +124,11 @@ def _settled_peak(
     """Fit a peak, then again within the window of the fitted width, until it converges."""
     peak = None
     noise = float(np.sqrt(np.mean(sigma**2)))
-    for _ in range(_WINDOWS):
-        reach = _CORE_SIGMAS * math.hypot(width, noise)
+    for _ in range(8):
+        reach = 2.5 * math.hypot(width, noise)  # the tails of a peak contain other events
         window = max(limits[0], centre - reach), min(limits[1], centre + reach)
         inside = (x > window[0]) & (x < window[1])
-        if np.count_nonzero(inside) < _LEAST_IN_PEAK or not window[0] < centre < window[1]:
+        if np.count_nonzero(inside) < 5 or not window[0] < centre < window[1]:
             return peak
         previous, peak = peak, fit_peak(x[inside], sigma[inside], window, centre, width)
         centre, width = peak.contrast, max(peak.width, 0.1 * math.hypot(width, noise))
@@ -146,29 +137,20 @@ def _settled_peak(
     return peak
 
 
-def _half_width(grid: FloatArray, density: FloatArray, place: int, level: float) -> float:
-    """Mean distance from the mode to where the density has fallen to `level`."""
-    left = np.flatnonzero(density[:place] < level)
-    right = np.flatnonzero(density[place:] < level)
-    sides = []
-    if left.size:
-        sides.append(grid[place] - grid[left[-1]])
-    if right.size:
-        sides.append(grid[place + right[0]] - grid[place])
-    return float(np.mean(sides)) if sides else float(grid[-1] - grid[0])
-
-
 def fit_peak(
     x: FloatArray, sigma: FloatArray, window: tuple[float, float], centre: float, width: float
 ) -> ContrastPeak:
     """Fit a normal distribution, truncated to the window, on a flat background."""
     loss = partial(peak_loss, x, sigma, window, centre, width)
-    bounds = [(-1.5, 1.5), (-2.5, 1.0), (-3.0, 6.0)]
+    low, high = np.array([(-1.5, 1.5), (-2.5, 1.0), (-3.0, 6.0)]).T
+    bounds = list(zip(low, high, strict=True))
     best = scipy.optimize.minimize(loss, [0.0, 0.0, 2.0], jac=True, method="TNC", bounds=bounds)
-    theta = np.asarray(best.x)
-    curvature = _hessian(lambda at: loss(at)[0], theta, bounds)
-    free = np.array([lo + 1e-3 < t < hi - 1e-3 for t, (lo, hi) in zip(theta, bounds, strict=True)])
+    theta, step = np.asarray(best.x), 1e-3
+    free = (theta > low + step) & (theta < high - step)
     free[0] = True
+    at = np.clip(theta, low + step, high - step)
+    slopes = [[loss(at + side * unit)[1] for unit in step * np.eye(3)] for side in (-1, 1)]
+    curvature = np.diff(slopes, axis=0)[0] / (2 * step)
     spread = width * math.exp(theta[1])
     share = 1 / (1 + math.exp(-theta[2]))
     fallback = math.sqrt((spread**2 + float(np.mean(sigma**2))) / max(share * x.size, 1.0))
@@ -214,38 +196,11 @@ def peak_loss(
     return -float(np.sum(np.log(density / flat))), np.array(gradient)
 
 
-def _hessian(
-    function: Callable[[FloatArray], float],
-    theta: FloatArray,
-    bounds: Sequence[tuple[float, float]],
-) -> FloatArray:
-    """Second differences, one-sided steps kept inside the bounds."""
-    step = 1e-3
-    at = np.array(
-        [np.clip(t, lo + step, hi - step) for t, (lo, hi) in zip(theta, bounds, strict=True)]
-    )
-    unit = step * np.eye(theta.size)
-    out = np.empty((theta.size, theta.size))
-    for i in range(theta.size):
-        for j in range(theta.size):
-            out[i, j] = (
-                function(at + unit[i] + unit[j])
-                - function(at + unit[i] - unit[j])
-                - function(at - unit[i] + unit[j])
-                + function(at - unit[i] - unit[j])
-            ) / (4 * step**2)
-    return out
-
-
 LEAST_PROBABILITY = 1e-4
 """A line whose χ² is less probable than this does not fit its standards."""
 
 OFFSET_SHARE = 0.35
 """Largest contrast at zero mass, over the contrast of the lightest peak."""
-
-_FITTING_DISTANCE = 0.05  # largest relative distance of a standard that a message says to fit
-_NAMED_DISTANCE = 0.2  # largest relative distance of a peak from where somebody says it is
-_MOST_STANDARDS = 8  # with more, no subsets are tried for a message
 
 
 def match(peaks: Sequence[ContrastPeak], masses: FloatArray, name: str) -> list[ContrastPeak]:
@@ -272,7 +227,8 @@ def pick(
     for contrast, mass in zip(contrasts, masses, strict=True):
         nearest = min(peaks, key=lambda peak: abs(peak.contrast - contrast), default=None)
         off = math.inf if nearest is None else abs(nearest.contrast / contrast - 1)
-        if nearest is None or off > _NAMED_DISTANCE or nearest in chosen:
+        # a peak may be by a fifth from where somebody says it is
+        if nearest is None or off > 0.2 or nearest in chosen:
             raise DataError(
                 f"{name}: the standard of {mass:g} kDa has no peak of its own near |contrast| = "
                 f"{contrast:.3g} ({_found(peaks)}); name other peaks"
@@ -292,9 +248,8 @@ def check_match(
 
     Shapes: `masses` (n,).
     """
-    contrast = np.array([peak.contrast for peak in chosen])
-    slope, offset = abs(line.slope), math.copysign(1.0, line.slope) * line.intercept
-    off = (contrast - offset) / slope / masses - 1
+    offset = math.copysign(1.0, line.slope) * line.intercept
+    off = _misses(chosen, masses, abs(line.slope), offset)
     worst = int(np.argmax(np.abs(off)))
     start = f"{name}: the standards {_shown(masses)} do not match the peaks ({_found(peaks)}): "
     if line.dof and float(chdtrc(line.dof, line.chi2)) < LEAST_PROBABILITY:
@@ -303,33 +258,48 @@ def check_match(
             f"{100 * abs(off[worst]):.1f} %, with χ² = {line.chi2:.3g} for "
             f"{count(line.dof, 'degree')} of freedom; {_advice(peaks, masses)}"
         )
-    if abs(offset) > OFFSET_SHARE * contrast[0]:
+    if abs(offset) > OFFSET_SHARE * chosen[0].contrast:
         raise DataError(
             f"{start}zero mass would have the contrast {offset:.2g}, more than {OFFSET_SHARE:g} of "
             f"that of the lightest standard; {_advice(peaks, masses)}"
         )
 
 
+def _misses(
+    chosen: Sequence[ContrastPeak], masses: FloatArray, slope: float, offset: float
+) -> FloatArray:
+    """Give the relative distances of standards from where a line has their peaks."""
+    contrast = np.array([peak.contrast for peak in chosen])
+    return np.asarray((contrast - offset) / slope / masses - 1)
+
+
+def _through(chosen: Sequence[ContrastPeak], masses: FloatArray) -> tuple[float, float]:
+    """Give slope and offset of a line through peaks, each of the same relative error."""
+    contrast = np.array([peak.contrast for peak in chosen])
+    slope, offset = np.polyfit(masses, contrast, 1, w=1 / contrast).tolist()
+    return slope, offset
+
+
 def _nearest(peaks: Sequence[ContrastPeak], masses: FloatArray) -> tuple[list[ContrastPeak], float]:
     """Choose peaks for the standards, and give their total distance from the line."""
     most = max(peak.count for peak in peaks)
-    best, least = list(peaks[: masses.size]), math.inf
-    for chosen in combinations(peaks, int(masses.size)):
-        contrast = np.array([peak.contrast for peak in chosen])
-        slope, offset = np.polyfit(masses, contrast, 1, w=1 / contrast)
+
+    def cost(chosen: tuple[ContrastPeak, ...]) -> float:
+        slope, offset = _through(chosen, masses)
         if slope <= 0:
-            continue
-        off = (contrast - offset) / slope / masses - 1
-        cost = float(np.sum((off / 0.02) ** 2)) + (offset / (0.15 * contrast[0])) ** 2
-        cost -= 2 * sum(math.log(peak.count / most) for peak in chosen)
-        if cost < least:
-            best, least = list(chosen), cost
-    return best, least
+            return math.inf
+        away = float(np.sum((_misses(chosen, masses, slope, offset) / 0.02) ** 2))
+        away += (offset / (0.15 * chosen[0].contrast)) ** 2
+        return away - 2 * sum(math.log(peak.count / most) for peak in chosen)
+
+    best = min(combinations(peaks, int(masses.size)), key=cost)
+    return list(best), cost(best)
 
 
 def _advice(peaks: Sequence[ContrastPeak], masses: FloatArray) -> str:
     """Name the standards that fit the peaks and those that do not."""
-    known = _fitting(peaks, masses) if masses.size <= _MOST_STANDARDS else None
+    # of more standards than 8 there are too many subsets
+    known = _fitting(peaks, masses) if masses.size <= 8 else None
     if known is None:
         return "name the standards that are in the sample"
     others = masses[~np.isin(masses, known)]
@@ -341,13 +311,11 @@ def _fitting(peaks: Sequence[ContrastPeak], masses: FloatArray) -> FloatArray | 
     """Find the largest part of the standards, two at least, that lies on a line through peaks."""
     for size in range(min(int(masses.size) - 1, len(peaks)), 1, -1):
         fits: list[tuple[float, FloatArray]] = []
-        for part in combinations(masses.tolist(), size):
-            some = np.array(part)
+        for some in map(np.array, combinations(masses.tolist(), size)):
             chosen, cost = _nearest(peaks, some)
-            contrast = np.array([peak.contrast for peak in chosen])
-            slope, offset = np.polyfit(some, contrast, 1, w=1 / contrast)
-            off = np.abs((contrast - offset) / slope / some - 1).max() if slope > 0 else math.inf
-            if off < _FITTING_DISTANCE and abs(offset) < OFFSET_SHARE * contrast[0]:
+            slope, offset = _through(chosen, some)
+            near = slope > 0 and np.abs(_misses(chosen, some, slope, offset)).max() < 0.05
+            if near and abs(offset) < OFFSET_SHARE * chosen[0].contrast:
                 fits.append((cost, some))
         if fits:
             return min(fits, key=lambda fit: fit[0])[1]
@@ -371,12 +339,9 @@ STANDARD_ERROR = 0.01
 LEAST_EVENTS = 30
 """Fewest events for a histogram."""
 
-_LANDING_SHARE = 0.4
 _CONTRAST_PER_KDA = (3e-7, 1.5e-3)
 # Contrast per kDa of any microscope: 3e-5 in visible light, up to 30 times as much if a mask dims
 # the reference; less for dense metals, and at long wavelengths if the reference is not dimmed.
-_LIGHTEST_KDA = 10.0  # lighter than any standard that can be detected
-_KERNEL_WIDTHS = (1.0, 2.0, 4.0, 0.5)
 
 
 def calibrate_mass(
@@ -403,7 +368,7 @@ def calibrate_mass(
     signed, errors = signed[finite], errors[finite]
     direction = -1.0 if landing == "dark" else 1.0
     lands = direction * signed > 0
-    if signed.size >= LEAST_EVENTS and lands.mean() < _LANDING_SHARE:
+    if signed.size >= LEAST_EVENTS and lands.mean() < 0.4:
         other = "bright" if landing == "dark" else "dark"
         raise SignError(
             f"{name}: only {lands.sum()} of {signed.size} events are {landing}, which landing "
@@ -421,18 +386,14 @@ def calibrate_mass(
     # kernels hardly accepts more wrong standards (3 in 100 random ones, with twelve events each),
     # since a line through other peaks must meet the same limits.
     refusals: list[tuple[int, DataError]] = []
-    for detail in _KERNEL_WIDTHS:
+    for detail in (1.0, 2.0, 4.0, 0.5):
         peaks = find_contrast_peaks(size, size_errors, detail=detail)
         try:
             chosen = (
                 match(peaks, masses, name) if named is None else pick(peaks, named, masses, name)
             )
-            line = york_line(
-                masses,
-                masses_se,
-                [direction * p.contrast for p in chosen],
-                [p.contrast_se for p in chosen],
-            )
+            contrast, errors = np.array([(p.contrast, p.contrast_se) for p in chosen]).T
+            line = york_line(masses, masses_se, direction * contrast, errors)
             check_match(line, chosen, peaks, masses, name)
             break
         except DataError as refusal:
@@ -441,11 +402,7 @@ def calibrate_mass(
         raise max(refusals, key=lambda each: each[0])[1]
     _refuse_unlikely(line.slope, float(size.max()), masses, name)
     widen = max(1.0, line.chi2 / line.dof) if line.dof else 1.0
-    findings = []
-    if widen > 1:
-        findings.append(STANDARDS_SCATTER({"chi2_per_dof": widen, "widened": math.sqrt(widen)}))
-    if not line.dof:
-        findings.append(TWO_STANDARDS())
+    scatter = STANDARDS_SCATTER({"chi2_per_dof": widen, "widened": math.sqrt(widen)})
     result = MassCalibration(
         gradient_per_kda=line.slope,
         offset=line.intercept,
@@ -456,9 +413,11 @@ def calibrate_mass(
         peaks=tuple(peaks),
         landing=landing,
         events=int(size.size),
-        findings=tuple(findings),
+        findings=tuple(
+            existing([scatter if widen > 1 else None, None if line.dof else TWO_STANDARDS()])
+        ),
     )
-    return replace(result, standards=_table(result, chosen, masses, masses_se, direction))
+    return replace(result, standards=_table(result, chosen, masses, masses_se))
 
 
 def _standards(
@@ -504,7 +463,7 @@ def _refuse_unlikely(slope: float, largest: float, masses: FloatArray, name: str
         raise DataError(
             f"{problem}`standards_kda` = {shown} seem to be in Da; give them in kDa, as 66,146,480"
         )
-    if masses.max() < _LIGHTEST_KDA:
+    if masses.max() < 10.0:  # lighter than any standard that can be detected
         raise DataError(
             f"{problem}`standards_kda` = {shown} seem to be in MDa; give them in kDa, as 66,146,480"
         )
@@ -514,27 +473,15 @@ def _refuse_unlikely(slope: float, largest: float, masses: FloatArray, name: str
 
 
 def _table(
-    calibration: MassCalibration,
-    chosen: Sequence[ContrastPeak],
-    masses: FloatArray,
-    masses_se: FloatArray,
-    direction: float,
+    line: MassCalibration, chosen: Sequence[ContrastPeak], masses: FloatArray, masses_se: FloatArray
 ) -> pd.DataFrame:
-    contrast = direction * np.array([peak.contrast for peak in chosen])
-    errors = np.array([peak.contrast_se for peak in chosen])
-    mass = calibration.mass_kda(contrast)
-    low, high = calibration.prediction_interval(contrast, errors)
-    return pd.DataFrame(
-        {
-            "mass_kda": masses,
-            "mass_se": masses_se,
-            "contrast": contrast,
-            "contrast_se": errors,
-            "width": [peak.width for peak in chosen],
-            "count": [peak.count for peak in chosen],
-            "found_kda": mass,
-            "residual_percent": 100 * (mass / masses - 1),
-            "low_kda": low,
-            "high_kda": high,
-        }
-    )
+    """List the standards, their peaks and what the line makes of these."""
+    peaks = pd.DataFrame(map(vars, chosen))
+    contrast = (-1 if line.landing == "dark" else 1) * peaks["contrast"].to_numpy()
+    table = pd.DataFrame({"mass_kda": masses, "mass_se": masses_se, "contrast": contrast})
+    table = table.join(peaks[["contrast_se", "width", "count"]])
+    table["found_kda"] = line.mass_kda(contrast)
+    table["residual_percent"] = 100 * (table["found_kda"] / masses - 1)
+    intervals = line.prediction_interval(contrast, table["contrast_se"].to_numpy())
+    table["low_kda"], table["high_kda"] = intervals
+    return table

@@ -180,15 +180,9 @@ class Standards:
 
     def to_toml(self) -> str:
         """Write the end of the section ``[calibration]``, with its tables."""
-        covariance = None if self.covariance is None else self.covariance.model_dump()
-        tables = {
-            "optics": _optics_keys(self.optics),
-            "covariance": covariance,
-            "camera": self.camera.model_dump(exclude_none=True),
-        }
         lines = [f"height_nm = {toml_value(self.height_nm)}"]
-        for name, table in tables.items():
-            if table:
+        for name, table in self.to_dict().items():
+            if isinstance(table, dict) and table:
                 lines += ["", f"[calibration.{name}]"]
                 lines += [f"{key} = {toml_value(value)}" for key, value in table.items()]
         return "\n".join([*lines, ""])
