@@ -123,7 +123,7 @@ def checked(movie: FrameSource, camera: Camera) -> Check:
 
 
 def measured_windows(
-    movie: Stack,
+    movie: FrameSource,
     config: Config,
     camera: Camera,
     before: tuple[int, int] | None,

@@ -537,7 +537,8 @@ def make_chunk(
     edges, blocks, highest = _sum_blocks(stored, good, camera, stride, check, mapper, highest=True)
     electrons = blocks.sum(axis=0, dtype=np.float64)
     sums = sums_of(span, good, light_e, electrons, highest.max(axis=0), camera)
-    frames = {"counts": stored, "camera": camera, "edges": edges, "blocks_e": blocks}
+    frames: dict[str, Any] = {"counts": stored, "camera": camera, "edges": edges}
+    frames["blocks_e"] = blocks
     return Chunk(**vars(sums), **frames, check=check, let_go=_nothing, lends_blocks=False)
 
 
@@ -586,7 +587,8 @@ def make_tile_chunk(
         counts, sums.good, camera, stride, check_and_let_go, mapper, highest=False
     )
     let_go()
-    frames = {"counts": counts, "camera": camera, "edges": edges, "blocks_e": blocks}
+    frames: dict[str, Any] = {"counts": counts, "camera": camera, "edges": edges}
+    frames["blocks_e"] = blocks
     return Chunk(**vars(sums), **frames, check=check, let_go=let_go, lends_blocks=True)
 
 

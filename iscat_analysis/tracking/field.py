@@ -211,6 +211,7 @@ class MovingField:
         self.pixel_nm, self.roi_px = pixel_nm, roi_px
         self._pool, self._models, self._z_range_nm = pool, (near, far), z_range_nm
         self._room_of_slopes = np.empty(0, dtype=np.int16)
+        self._drawn: tuple[Localizations, Canvas, bool] | None = None
         rows, columns = used.shape
         wavelength = near.optics.wavelength_nm
         resolution = wavelength / near.optics.na
@@ -406,7 +407,7 @@ class MovingField:
 
     def draw_anew(self) -> None:
         """Mark all pictures to be drawn again in the next pass."""
-        self._drawn: tuple[Localizations, Canvas, bool] | None = None
+        self._drawn = None
 
     def draw(
         self, ground: BackgroundEstimate, rows: Localizations, *, coarse: bool = True

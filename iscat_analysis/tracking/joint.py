@@ -436,7 +436,8 @@ def _spread_over(
     """
 
     def left(image: FloatArray) -> FloatArray:
-        return image - coupling.followed(covariance, image[None])[1][0]
+        followed: FloatArray = coupling.followed(covariance, image[None])[1][0]
+        return image - followed
 
     square = (image.size, image.size)
     operator = scipy.sparse.linalg.LinearOperator(square, left, dtype=np.float64)

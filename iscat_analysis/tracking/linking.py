@@ -403,7 +403,7 @@ def _steps_nm2(rows: Localizations) -> FloatArray:
     """Mean square of the steps of each track from frame to frame; infinite where it has none."""
     track, steps = _steps(rows)
     squares = pd.Series((steps**2).sum(axis=1)).groupby(track).median() / math.log(2)
-    return squares.reindex(np.unique(rows.track), fill_value=np.inf).to_numpy(float)
+    return np.asarray(squares.reindex(np.unique(rows.track), fill_value=np.inf), dtype=float)
 
 
 def mean_square(steps: FloatArray) -> float:
@@ -691,8 +691,11 @@ def _pairs(rows: Localizations, near_nm: float) -> list[_Pair]:
     both, frame, tracks = both[order], frame[order], tracks[order]
     others = (np.diff(tracks, axis=0) != 0).any(axis=1) | (np.diff(frame) > _APART_FRAMES)
     runs = np.split(np.arange(len(both)), np.flatnonzero(others) + 1) if len(both) else []
-    spans = [(int(frame[run[0]]), int(frame[run[-1]]), *tracks[run[0]].tolist()) for run in runs]
-    return sorted(_Pair(*span, both[run]) for span, run in zip(spans, runs, strict=True))
+    pairs = []
+    for run in runs:
+        (first, last), (one, other) = frame[run[[0, -1]]].tolist(), tracks[run[0]].tolist()
+        pairs.append(_Pair(first, last, one, other, both[run]))
+    return sorted(pairs, key=lambda pair: pair[:4])
 
 
 def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int) -> IntArray:

@@ -105,7 +105,7 @@ def medians_of_tracks(track: IntArray, values: FloatArray) -> FloatArray:
 
     Shapes: `track` (n,), `values` (n,), result (n,).
     """
-    return pd.Series(values).groupby(track).transform("median").to_numpy(float)
+    return np.asarray(pd.Series(values).groupby(track).transform("median"), dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,8 @@ class Judged:
         observed, shift = np.full(fisher.shape, np.nan), np.zeros(bias.shape)
         observed[square] = (o + np.swapaxes(o, 1, 2)) / 2
         shift[np.ix_(good, index)] = np.einsum("nik,njk,nj->ni", v, v, bias[good][:, index])
-        return cls(fisher, observed, shift, *numbers.T, slopes)
+        gain, chi2, pixels, worst, level, growth = numbers.T
+        return cls(fisher, observed, shift, gain, chi2, pixels, worst, level, growth, slopes)
 
 
 _FARTHEST = 0.05  # step of the logarithm of the background

@@ -52,7 +52,7 @@ class FrameCandidates(NamedTuple):
 
     def only(self, kept: IntArray | BoolArray) -> FrameCandidates:
         """Select some candidates."""
-        return FrameCandidates(*(part[kept] for part in self))
+        return FrameCandidates._make(part[kept] for part in self)
 
 
 class FrameFilter:

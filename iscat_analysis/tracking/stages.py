@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -420,7 +421,12 @@ def _judged(task: Task, state: State) -> TrackedRows:
         unlike = shared_mass & crowded(rows, task.context.roi_px * task.context.pixel_nm)
     counted = state.done & field.holds(rows.theta) & ~near & ~unlike
     common = common_amplitudes(field, ground, rows, judged, counted)
-    found = {"judged": judged, "close": near | shared_mass, "field": field, "common": common}
+    found: dict[str, Any] = {
+        "judged": judged,
+        "close": near | shared_mass,
+        "field": field,
+        "common": common,
+    }
     return TrackedRows(**vars(state), **found, shared=shared_errors(field, ground, rows, judged))
 
 
