@@ -57,66 +57,47 @@ class Status(StrEnum):
 
 _ADVICE = {
     Status.OK: "The fit converged, inside its bounds, and agrees with the data.",
-    Status.NOT_CONVERGED: "The fit did not converge: check the optics, or enlarge fit.roi_nm.",
-    Status.AT_BOUND: "The best value of a parameter is beyond its bound: of a height (widen "
-    "fit.z_range_nm; at the coverslip check optics.focus_nm and the indices), of a position (no "
-    "particle there, or wrong optics), or of a mass (below a calibration.offset).",
-    Status.AMBIGUOUS_Z: "Another height explains the data almost as well: use more frames, "
-    "another focus, or a narrower fit.z_range_nm.",
-    Status.AMBIGUOUS_SIZE: "Another diameter explains the data almost as well: use more frames, "
-    "another focus, or a narrower fit.diameter_range_nm.",
-    Status.AMBIGUOUS_DIRECTION: "Another direction of a rod explains the data almost as well: use "
-    "more frames, another focus or another polarisation.",
-    Status.POOR_FIT: "The model does not describe the data: check focus, NA, pixel size, gain and "
-    "neighbours; a large particle that fit.spheres does not describe needs mode size.",
-    Status.TOO_CLOSE: "Another particle is nearer than detection.min_separation_nm: "
-    "treat the mass as shared between them.",
     Status.SIDELOBE: "Not larger than the residual of a brighter particle beside it, and not "
     "counted: check focus, NA and aberrations to tell whether it is a particle.",
     Status.NOT_DETECTED: "No particle stands out from the noise of the region, as noise alone does "
     "in at most 1 of 100 regions: use more frames or more light, or check where it was cut out.",
-    Status.UNCALIBRATED_OPTICS: "The contrast is right, but the mass scale was measured with "
-    "other optics: measure standards with these optics (iscat calibrate mass).",
-    Status.SATURATED: "The camera is saturated here: lower the exposure or the laser power.",
-    Status.PROCESSED: "The frames were interpolated, smoothed or sharpened, which changes their "
-    "noise and their particles: analyse the raw frames of the camera.",
-    Status.NONLINEAR: "The counts of the whole movie are not in proportion to its light, so that "
-    "all masses are wrong by the same factor: a line says by how much and why.",
+    Status.NOT_CONVERGED: "The fit did not converge: check the optics, or enlarge fit.roi_nm.",
+    Status.AT_BOUND: "The best value of a parameter is beyond its bound: of a height (widen "
+    "fit.z_range_nm; at the coverslip check optics.focus_nm and the indices), of a position (no "
+    "particle there, or wrong optics), or of a mass (below a calibration.offset).",
+    Status.LARGE: "It is no dipole, so that its contrast does not give its mass: the column model "
+    "says which sphere on the coverslip describes it, with its diameter.",
+    Status.POOR_FIT: "The model does not describe the data: check focus, NA, pixel size, gain and "
+    "neighbours; a large particle that fit.spheres does not describe needs mode size.",
     Status.CHANGING: "The light of the particle changes beside its step: the particle settles, "
     "bleaches, blinks or moves, or another one is at the same place; the mass is that of the mean "
     "change.",
     Status.EXTENDED: "The image is wider than that of a point: the particle wiggles by more than "
     "particle.wiggle_nm, or has separate parts, or the optics are not those configured; its mass "
     "is too small.",
-    Status.LARGE: "It is no dipole, so that its contrast does not give its mass: the column model "
-    "says which sphere on the coverslip describes it, with its diameter.",
+    Status.AMBIGUOUS_SIZE: "Another diameter explains the data almost as well: use more frames, "
+    "another focus, or a narrower fit.diameter_range_nm.",
+    Status.AMBIGUOUS_Z: "Another height explains the data almost as well: use more frames, "
+    "another focus, or a narrower fit.z_range_nm.",
+    Status.AMBIGUOUS_DIRECTION: "Another direction of a rod explains the data almost as well: use "
+    "more frames, another focus or another polarisation.",
+    Status.TOO_CLOSE: "Another particle is nearer than detection.min_separation_nm: "
+    "treat the mass as shared between them.",
+    Status.SATURATED: "The camera is saturated here: lower the exposure or the laser power.",
+    Status.UNCALIBRATED_OPTICS: "The contrast is right, but the mass scale was measured with "
+    "other optics: measure standards with these optics (iscat calibrate mass).",
+    Status.NONLINEAR: "The counts of the whole movie are not in proportion to its light, so that "
+    "all masses are wrong by the same factor: a line says by how much and why.",
+    Status.PROCESSED: "The frames were interpolated, smoothed or sharpened, which changes their "
+    "noise and their particles: analyse the raw frames of the camera.",
 }
 
-
-SEVERITY = (
-    Status.SIDELOBE,
-    Status.NOT_DETECTED,
-    Status.NOT_CONVERGED,
-    Status.AT_BOUND,
-    Status.LARGE,
-    Status.POOR_FIT,
-    Status.CHANGING,
-    Status.EXTENDED,
-    Status.AMBIGUOUS_SIZE,
-    Status.AMBIGUOUS_Z,
-    Status.AMBIGUOUS_DIRECTION,
-    Status.TOO_CLOSE,
-    Status.SATURATED,
-    Status.UNCALIBRATED_OPTICS,
-    Status.NONLINEAR,
-    Status.PROCESSED,
-)
+SEVERITY = tuple(status for status in _ADVICE if status is not Status.OK)
 """Flags of a fit, worst first: perhaps no particle; none above the noise; no estimate; no estimate
 inside the bounds; no dipole and so no mass; a model that does not describe the data, their change
 in time or their width; one of several diameters, heights or directions; a mass shared with a
 neighbour; pixels left out; a mass on the scale of other optics; counts that are not in proportion
 to the light; frames that were processed."""
-
 
 NO_EVENT = frozenset({Status.SIDELOBE, Status.NOT_DETECTED})
 """Verdicts on rows that are no particles: they are in no count, histogram or species."""
@@ -335,15 +316,8 @@ class Windows:
 
     def cut(self, region: tuple[slice, slice]) -> Windows:
         """Give the sums of some pixels."""
-        return replace(
-            self,
-            before_e=self.before_e[region],
-            after_e=self.after_e[region],
-            read_variance_before_e2=self.read_variance_before_e2[region],
-            read_variance_after_e2=self.read_variance_after_e2[region],
-            masked=self.masked[region],
-            saturated=self.saturated[region],
-        )
+        images = {name: value for name, value in vars(self).items() if np.ndim(value) == 2}
+        return replace(self, **{name: image[region] for name, image in images.items()})
 
 
 @dataclass(frozen=True)
