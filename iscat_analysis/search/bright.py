@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import islice
-from typing import Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import scipy.fft
@@ -113,8 +113,7 @@ class Motion(Protocol):
         """Light after over light before in a region, frames relative to the chunk."""
 
 
-@dataclass(frozen=True)
-class _Spot:
+class _Spot(NamedTuple):
     """A maximum of the energy."""
 
     frame: int
@@ -137,17 +136,13 @@ def find_bright_steps(
     moved = None if motion is None else motion.contrast
     # standard deviation of the spot over λ/NA
     spots = _spots(chunk, 1.0 * resolution_nm / pixel_nm, _SHADOW_NM / pixel_nm, moved, mapper)
+    cuts = _Cuts(chunk, spots, window, pixel_nm, motion)
     # one after the other: between small kernels threads wait for each other at the interpreter
-    cut = (
-        _cut(chunk, spot, spots, window, pixel_nm, roi_px, ALONE_NM, motion)
-        for spot in spots[: 4 * most]
-    )
+    cut = (cuts.of(spot, roi_px, ALONE_NM) for spot in spots[: 4 * most])
     alone = sorted(islice((step for step in cut if step), most), key=lambda step: -step.snr)
     # side of the region around a neighbour
     small = max(5, round(1700.0 / pixel_nm))
-    every = (
-        _cut(chunk, spot, spots, window, pixel_nm, small, _SHADOW_NM, motion) for spot in spots
-    )
+    every = (cuts.of(spot, small, _SHADOW_NM) for spot in spots)
     return tuple(alone), (step for step in every if step)
 
 
@@ -175,12 +170,10 @@ def _spots(
         if not 0 < ratio < 1e6:
             return
         excess, share = np.empty((2, *cells), dtype=np.float32)
-        step_energy(
-            chunk.blocks_e[low:middle], chunk.blocks_e[middle:high],
-            still if moved is None else moved[j], chunk.usable,
-            read * (frames[middle:high].sum() + ratio**2 * frames[low:middle].sum()),
-            ratio, side, excess, share,
-        )  # fmt: skip
+        before, after = chunk.blocks_e[low:middle], chunk.blocks_e[middle:high]
+        noise = read * (frames[middle:high].sum() + ratio**2 * frames[low:middle].sum())
+        change = still if moved is None else moved[j]
+        step_energy(before, after, change, chunk.usable, noise, ratio, side, excess, share)
         energy[j] = _smoothed_energy(excess, share, spot_px / side, spot_px)
 
     for _ in mapper(one, range(count)):
@@ -251,72 +244,65 @@ def _maxima(energy: NDArray[np.floating], shadow_px: float) -> list[tuple[int, i
     return taken
 
 
-def _cut(
-    chunk: Chunk,
-    spot: _Spot,
-    spots: Sequence[_Spot],
-    window: int,
-    pixel_nm: float,
-    roi_px: int,
-    alone_nm: float,
-    motion: Motion | None,
-) -> BrightStep | None:
-    """Date a step and sum the frames around it in which nothing else happens; None if too few."""
-    low, high = max(chunk.first, spot.frame - window), min(chunk.stop, spot.frame + window)
-    margin = max(1, window // (2 * STRIDES)) + 1  # a spot's frame is known to half a block
-    for other in spots:
-        if other is spot or _distance(other, spot) * pixel_nm > alone_nm:
-            continue
-        if other.frame <= spot.frame:
-            low = max(low, other.frame + margin)
-        if other.frame >= spot.frame:
-            high = min(high, other.frame - margin)
-    row, column = spot.row, spot.column
-    step: BrightStep | None = None
-    frame = spot.frame
-    for gap in (0, None, None):  # roughly, then dated with its own picture and centred
-        rows, columns = _region(row, roi_px), _region(column, roi_px)
-        if min(rows[0], columns[0]) < 0 or rows[1] > chunk.shape[0] or columns[1] > chunk.shape[1]:
-            return None
-        if step is None or (rows, columns) != (step.rows, step.columns):  # often it stays
-            patch = chunk.patch(low, high, rows, columns)
-        if gap is None and step is not None:
-            dated = locate_step(patch, _core(step, pixel_nm), (low + 1, high))
-            # A step whose height changes before or after it, with less than this chance, is left
-            # out.
-            if dated.p_constant < (1e-3):
+@dataclass(frozen=True)
+class _Cuts:
+    """Steps of a chunk, with the frames around each in which nothing else happens."""
+
+    chunk: Chunk
+    spots: Sequence[_Spot]
+    window: int
+    pixel_nm: float
+    motion: Motion | None
+
+    def of(self, spot: _Spot, roi_px: int, alone_nm: float) -> BrightStep | None:
+        """Date a step and sum the frames before and after it; None if these are too few."""
+        chunk, frame, gap = self.chunk, spot.frame, 0
+        low, high = self._quiet(spot, alone_nm)
+        centre, step = (spot.row, spot.column), None
+        for _ in range(3):  # roughly, then dated with its own picture and centred
+            first = [place - roi_px // 2 for place in centre]
+            rows, columns = ((place, place + roi_px) for place in first)
+            if min(first) < 0 or rows[1] > chunk.shape[0] or columns[1] > chunk.shape[1]:
                 return None
-            frame, gap = dated.frame, dated.gap
-        if min(frame - (gap or 0) - low, high - frame - (gap or 0)) < LEAST_FRAMES:
-            return None
-        before, n_before, power_before = patch.window(low, frame - (gap or 0))
-        after, n_after, power_after = patch.window(frame + (gap or 0), high)
-        if min(n_before, n_after) < LEAST_FRAMES:
-            return None
-        moved: FloatArray | float = 1.0
-        if motion is not None:
-            cuts = chunk.cut(low, frame - (gap or 0)), chunk.cut(frame + (gap or 0), high)
-            moved = motion.between(rows, columns, *cuts)
-        step = BrightStep(
-            frame=frame, x_px=column, y_px=row, snr=0.0, rows=rows, columns=columns,
-            before_e=before, after_e=after, frames_before=(low, frame - (gap or 0)),
-            frames_after=(frame + (gap or 0), high), n_before=n_before, n_after=n_after,
-            power_ratio=power_after / power_before, usable=patch.usable,
-            read_variance_e2=np.full(before.shape, np.square(patch.read_noise_e)), motion=moved,
-        )  # fmt: skip
-        y_px, x_px, snr = centre_of_energy(*measured_contrast(step), pixel_nm)
-        step = replace(step, y_px=y_px + rows[0], x_px=x_px + columns[0], snr=snr)
-        row, column = round(step.y_px), round(step.x_px)
-    return step
+            if step is None or (rows, columns) != (step.rows, step.columns):  # often it stays
+                patch = chunk.patch(low, high, rows, columns)
+            if step is not None:
+                dated = locate_step(patch, _core(step, self.pixel_nm), (low + 1, high))
+                # a step whose height changes before or after it, by less than this chance
+                if dated.p_constant < 1e-3:
+                    return None
+                frame, gap = dated.frame, dated.gap
+            ends = (low, frame - gap), (frame + gap, high)
+            if min(last - start for start, last in ends) < LEAST_FRAMES:
+                return None
+            (before, after), counts, power = zip(*(patch.window(*end) for end in ends), strict=True)
+            if min(counts) < LEAST_FRAMES:
+                return None
+            moved: FloatArray | float = 1.0
+            if self.motion is not None:
+                moved = self.motion.between(rows, columns, *(chunk.cut(*end) for end in ends))
+            read = np.full(before.shape, np.square(patch.read_noise_e))
+            sums = before, after, *ends, *counts, power[1] / power[0], patch.usable, read, moved
+            step = BrightStep(frame, centre[1], centre[0], 0.0, rows, columns, *sums)
+            y_px, x_px, snr = centre_of_energy(*measured_contrast(step), self.pixel_nm)
+            step = replace(step, y_px=y_px + first[0], x_px=x_px + first[1], snr=snr)
+            centre = round(step.y_px), round(step.x_px)
+        return step
 
-
-def _distance(one: _Spot, other: _Spot) -> float:
-    return math.hypot(one.row - other.row, one.column - other.column)
-
-
-def _region(centre: int, side: int) -> tuple[int, int]:
-    first = centre - side // 2
-    return first, first + side
+    def _quiet(self, spot: _Spot, alone_nm: float) -> tuple[int, int]:
+        """Give the frames around a spot in which nothing else happens near it."""
+        low = max(self.chunk.first, spot.frame - self.window)
+        high = min(self.chunk.stop, spot.frame + self.window)
+        margin = max(1, self.window // (2 * STRIDES)) + 1  # a frame is known to half a block
+        for other in self.spots:
+            away = math.hypot(other.row - spot.row, other.column - spot.column)
+            if other is spot or away * self.pixel_nm > alone_nm:
+                continue
+            if other.frame <= spot.frame:
+                low = max(low, other.frame + margin)
+            if other.frame >= spot.frame:
+                high = min(high, other.frame - margin)
+        return low, high
 
 
 def measured_contrast(step: BrightStep) -> tuple[FloatArray, FloatArray]:

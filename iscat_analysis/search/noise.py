@@ -28,7 +28,6 @@ MOVIE_SHARE = 10
 
 
 _LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100)
-_SLOPE_DISTANCES_PX = (1, 2, 3, 4)  # pixels, whose differences make up the slope of a fine pattern
 _PARTS = 4  # of a field, which a pattern that moves has in common
 _ROWS = 16  # on which the noise is measured
 _ROWS_TOGETHER = 64  # the same beside what the pattern's motion makes, of which slopes tell
@@ -138,13 +137,9 @@ class _Strip:
         if not self.adjacent:
             return _Compared(noise, math.nan, math.nan)
         light = before + after
-        slopes = np.stack(
-            [
-                _across(light, reach, axis) / light
-                for axis in (1, 2)
-                for reach in _SLOPE_DISTANCES_PX
-            ]
-        )
+        # pixels, whose differences make up the slope of a fine pattern
+        steps = ((reach, axis) for axis in (1, 2) for reach in (1, 2, 3, 4))
+        slopes = np.stack([_across(light, *step) / light for step in steps])
         seen = np.moveaxis(slopes[:, :, lit] / sigma[:, lit], 0, -1)  # (pair, pixel, slope)
         # standard deviations, from which on a difference is not asked of motion
         usual = np.abs(change) < 4.0 * math.sqrt(noise)

@@ -74,11 +74,8 @@ def summits(
     (dy, higher), (dx, neighbour) = vertices(fine[each, :, j], i), vertices(fine[each, i], j)
     height = fine[each, i, j] + higher + neighbour
     spacing = float(_FINE[1] - _FINE[0])
-    return (
-        _FINE[i] + spacing * dy,
-        _FINE[j] + spacing * dx,
-        np.maximum(height - np.abs(value), 0.0),
-    )
+    above = np.maximum(height - np.abs(value), 0.0)
+    return _FINE[i] + spacing * dy, _FINE[j] + spacing * dx, above
 
 
 def _mirrored(places: NDArray[np.int64], size: int) -> NDArray[np.int64]:
@@ -194,16 +191,8 @@ def size_on_ring(
     near = known[np.hypot(known[:, 0] - x0, known[:, 1] - y0) < reach]
     # of the ring, along it
     highest = np.empty(max(8, round(2 * math.pi * distance / 4.0)))
-    ring_heights(
-        # around the candidate, which is its own
-        snr,
-        (float(x0), float(y0)),
-        (float(xc), float(yc)),
-        _RING_PX,
-        5.0,
-        near,
-        highest,
-    )
+    ring = (float(x0), float(y0)), (float(xc), float(yc)), _RING_PX
+    ring_heights(snr, *ring, 5.0, near, highest)  # but around the candidate, which is its own
     seen = np.sort(highest[highest >= 0])
     if not seen.size:
         return 0.0

@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,15 +116,8 @@ def make_filter(chunk: Chunk, template: FloatArray, noise: NoiseSpectrum | None 
     spectra = fft.rfft2(np.roll(reversed_, (-half, -half), axis=(1, 2)))
     norm = fft.irfft2(fft.rfft2(weight) * spectra[1], s=size)[:rows, :columns] * scale**2
     norm = np.maximum(norm, 1e-6 * norm.max())
-    return Filter(
-        spectra[0].astype(np.complex64),
-        size,
-        half,
-        weight[:rows, :columns].astype(np.float32),
-        norm.astype(np.float32),
-        noise,
-        template,
-    )
+    light, norm = (part[:rows, :columns].astype(np.float32) for part in (weight, norm))
+    return Filter(spectra[0].astype(np.complex64), size, half, light, norm, noise, template)
 
 
 def sliding_maps(
@@ -162,11 +156,8 @@ def sliding_maps(
         image = np.zeros(matched.size, dtype=np.float32)
         contrast_map(blocks[low:middle], blocks[middle:high], matched.weight, image)
         if explained is not None:
-            known = explained(
-                j,
-                slice(int(chunk.edges[low]), int(chunk.edges[middle])),
-                slice(int(chunk.edges[middle]), int(chunk.edges[high])),
-            )
+            first, turn, last = chunk.edges[[low, middle, high]].tolist()
+            known = explained(j, slice(first, turn), slice(turn, last))
             if known is not None:
                 image[:rows, :columns] -= (matched.weight * known).astype(np.float32)
         if matched.noise is not None:
@@ -210,8 +201,7 @@ def _store_behind(
         room[j] = made
 
 
-@dataclass(frozen=True)
-class Peak:
+class Peak(NamedTuple):
     """A place and boundary with a local maximum of the filtered contrast."""
 
     frame: int

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,11 +108,8 @@ def make_templates(
         images.append(signal / (weak**2 if bare.rho == 0 else weak))
         roughness.append(_roughness(signal, gradient[: 2 if z_range_nm is None else 3], noise))
     stacked = np.stack(images)
-    extremes = np.take_along_axis(
-        stacked.reshape(heights.size, -1),
-        np.abs(stacked.reshape(heights.size, -1)).argmax(axis=1)[:, None],
-        axis=1,
-    )[:, 0]
+    flat = stacked.reshape(heights.size, -1)
+    extremes = flat[np.arange(heights.size), np.abs(flat).argmax(axis=1)]
     two_sided = z_range_nm is None and model.rho > 0 and detection.polarity == "both"
     rough = np.mean(roughness, axis=0)
     size = field_px[0] * field_px[1] * pixel_nm**2
@@ -119,13 +117,9 @@ def make_templates(
     if z_range_nm is not None:
         volume = extent(rough, size * float(heights[-1] - heights[0]))
     alarms = detection.false_alarms_per_movie / (2 if two_sided else 1)
-    excursions = Excursions(
-        area,
-        volume,
-        correlation,
-        _autocorrelation(stacked[0], noise) if in_turn and two_sided else None,
-        extent(rough[:2, :2], pixel_nm**2),
-    )
+    along = _autocorrelation(stacked[0], noise) if in_turn and two_sided else None
+    of_pixel = extent(rough[:2, :2], pixel_nm**2)
+    excursions = Excursions(area, volume, correlation, along, of_pixel)
     return Templates(
         z_nm=heights,
         images=stacked,
@@ -194,36 +188,18 @@ def find_particles(
     refuse_flood(len(peaks), templates, excess_noise)
     found: list[Candidate] = []
     for peak in peaks:
-        near = (
-            (peak.height, other, max(abs(peak.column - other.x_px), abs(peak.row - other.y_px)))
-            for other in found
-        )
-        shadowed = any(
-            height < abs(other.snr) * (SIDELOBE if away < roi_px else FAR_LOBE)
-            for height, other, away in near
-        ) or any(
-            math.hypot(peak.column - other.x_px, peak.row - other.y_px) < NEAR * roi_px
-            for other in found
-        )
-        if shadowed:
+        if any(_is_lobe(peak, other, roi_px) for other in found):
             continue
         at = peak.layer, peak.row, peak.column
         higher = peak.height / float(ranked[at])
-        found.append(
-            Candidate(
-                x_px=peak.x_px,
-                y_px=peak.y_px,
-                z_nm=float(templates.z_nm[peak.layer]),
-                mass_kda=_mass(likelihood.model, templates, float(strength[at]) * higher),
-                snr=float(snr[at]) * higher,
-                beside=_strongest_lobe(best, peak, known, roi_px),
-            )
-        )
+        z_nm, beside = float(templates.z_nm[peak.layer]), _strongest_lobe(best, peak, known, roi_px)
+        mass = _mass(likelihood.model, templates, float(strength[at]) * higher)
+        snr_there = float(snr[at]) * higher
+        found.append(Candidate(peak.x_px, peak.y_px, z_nm, mass, snr_there, beside))
     return tuple(found)
 
 
-@dataclass(frozen=True)
-class _Peak:
+class _Peak(NamedTuple):
     """A maximum of the ranked maps: its layer and pixel, and where and how high it is between."""
 
     layer: int
@@ -232,6 +208,13 @@ class _Peak:
     y_px: float
     x_px: float
     height: float
+
+
+def _is_lobe(peak: _Peak, other: Candidate, roi_px: float) -> bool:
+    """Whether a peak may be a side lobe of a higher one, or is too near to it to tell."""
+    x, y = abs(peak.column - other.x_px), abs(peak.row - other.y_px)
+    share = SIDELOBE if max(x, y) < roi_px else FAR_LOBE
+    return peak.height < abs(other.snr) * share or math.hypot(x, y) < NEAR * roi_px
 
 
 def _peaks(
@@ -259,7 +242,7 @@ def _strongest_lobe(
     The nearest particles are tried first; the search ends with one that hides the candidate.
     """
     place = peak.x_px, peak.y_px
-    away = {k: math.hypot(k[0] - place[0], k[1] - place[1]) for k in known}
+    away = {k: math.dist(k, place) for k in known}
     near = sorted((k for k in away if away[k] < LARGEST_IMAGE * roi_px), key=lambda k: away[k])
     lobe = 0.0
     for k in near:

@@ -232,10 +232,8 @@ class Coupling:
         seen = np.multiply(images.reshape(-1, *self._weight.shape), self._sigma, order="C")
         felt = np.zeros((len(self._rows), len(images), covariance.shape[1]))
         out = np.zeros_like(seen)
-        follow(
-            self._slopes, self._rows, self._squares, covariance, seen, felt, out,
-            np.empty(self._room), np.empty(covariance.shape[1]),
-        )  # fmt: skip
+        room = np.empty(self._room), np.empty(covariance.shape[1])
+        follow(self._slopes, self._rows, self._squares, covariance, seen, felt, out, *room)
         return felt, (out * self._sigma).reshape(images.shape)
 
 

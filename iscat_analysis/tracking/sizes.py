@@ -42,12 +42,6 @@ from iscat_analysis.species.tracks import SLOWED_BY_WALL, Correlation
 from iscat_analysis.tracking.frames import exposure_of
 from iscat_analysis.tracking.table import ALONG, path_shifts
 
-LEAST_ABSORPTION = 1e-6
-"""Imaginary part of an index from which a single index does not describe the material."""
-
-LEAST_APART = 0.25
-"""Logarithm of the ratio of two masses below which a maximum that was given up may be the best."""
-
 _SHOWS_SIZE = {Status.AMBIGUOUS_SIZE, Status.AMBIGUOUS_Z}
 """Flags of a frame that says something of the diameter all the same."""
 
@@ -111,13 +105,16 @@ def sphere_track(
     if variance > 0:
         z = np.array([event.fit.z_nm for event in fitted])
         place = averaged, context.roi_px, context.pixel_nm
-        moved = path_shifts(*place, z, start_kda, variance)
-        fitted = [_with_path(event, one) for event, one in zip(fitted, moved, strict=True)]
+        moved = np.linalg.norm(path_shifts(*place, z, start_kda, variance), axis=2)
+        for number, (event, more) in enumerate(zip(fitted, moved, strict=True)):
+            fit = replace(event.fit, sigma=np.hypot(event.fit.sigma, more))
+            fitted[number] = replace(event, fit=fit)
         of_used = path_shifts(*place, sizes[0].places[:, 2], start_kda, variance)[:, 3]
         wider = of_used[:, :3].sum(axis=1) / ALONG * (sigma_d / d_um2_s)
         shifts = np.column_stack([of_used, wider])
     configured = homogeneous = None
-    if d_um2_s > 0 and abs(model.sphere.index.imag) < LEAST_ABSORPTION and sizes[0].converged:
+    # a single index describes a material whose index has an imaginary part of less than 1e-6
+    if d_um2_s > 0 and abs(model.sphere.index.imag) < 1e-6 and sizes[0].converged:
         motion = _motion(context.config, d_um2_s, sigma_d, sizes[0])
         likelihoods = [event.likelihood for event in used]
         configured, homogeneous = (
@@ -148,9 +145,15 @@ def explained(
             if abs(index / model.optics.n_sample - 1) < INVISIBLE:  # a shell may undo its core
                 continue
         one = fit_common_size(
-            likelihoods, tried, size.likely, z_range_nm,
-            frames=size.frames, mass_kda=size.mass_kda, index=index, motion=motion,
-        )  # fmt: skip
+            likelihoods,
+            tried,
+            size.likely,
+            z_range_nm,
+            frames=size.frames,
+            mass_kda=size.mass_kda,
+            index=index,
+            motion=motion,
+        )
         if one is not None and one.converged:
             found.append(one)
     return max(found, key=lambda one: one.log_likelihood, default=None)
@@ -189,19 +192,11 @@ def _diffusion(context: AnalysisContext, events: Sequence[Event]) -> tuple[float
 def _range_around(model: SizedModel, sizes: Sequence[CommonSize]) -> tuple[float, float]:
     """Masses nearer to the best than to any other likely one [kDa]."""
     best, *others = (one.mass_kda for one in sizes)
-    apart = [other for other in others if abs(math.log(other / best)) > LEAST_APART]
-    middles = [math.sqrt(best * other) for other in apart]
+    # a maximum that was given up nearer than a quarter in ln(mass) may be the best
+    middles = [math.sqrt(best * o) for o in others if abs(math.log(o / best)) > 0.25]
     low, high = model.mass_range_kda
-    return (
-        max([low, *(middle for middle in middles if middle < best)]),
-        min([high, *(middle for middle in middles if middle > best)]),
-    )
-
-
-def _with_path(event: Event, moved: FloatArray) -> Event:
-    """Add what the unknown path of the exposure does to the errors of a fit."""
-    sigma = np.sqrt(event.fit.sigma**2 + np.sum(moved**2, axis=1))
-    return replace(event, fit=replace(event.fit, sigma=sigma))
+    lower, upper = ([m for m in middles if (m < best) == below] for below in (True, False))
+    return max([low, *lower]), min([high, *upper])
 
 
 def table_of_sizes(tracks: dict[int, SphereTrack], correlation: Correlation | None) -> pd.DataFrame:
@@ -224,14 +219,18 @@ def _record(track: SphereTrack, correlation: Correlation | None) -> dict[str, fl
     per_kda = diameter / (3 * mass)
     weights = [one.log_weight - best.log_weight for one in track.sizes if one.converged]
     known = math.nan if not best.converged else 1.0
-    return _refraction(track, among, (own + paths) / own) | _odds(track, (own + paths) / bound) | {
-        "mass_kda": known * mass, "sigma_mass_kda": known * sigma,
-        "crb_mass_kda": known * math.sqrt(bound),
-        "optical_diameter_nm": known * diameter,
-        "sigma_optical_diameter_nm": known * per_kda * sigma,
-        "crb_optical_diameter_nm": known * per_kda * math.sqrt(bound),
-        "optical_probability": known / sum(map(math.exp, weights or [0.0])),
-    }  # fmt: skip
+    masses, kinds = (mass, sigma, math.sqrt(bound)), ("", "sigma_", "crb_")
+    diameters = diameter, per_kda * sigma, per_kda * masses[2]
+    record = {f"{kind}mass_kda": known * m for kind, m in zip(kinds, masses, strict=True)}
+    record |= {
+        f"{kind}optical_diameter_nm": known * d for kind, d in zip(kinds, diameters, strict=True)
+    }
+    record["optical_probability"] = known / sum(map(math.exp, weights or [0.0]))
+    return (
+        record
+        | _refraction(track, among, (own + paths) / own)
+        | _odds(track, (own + paths) / bound)
+    )
 
 
 def _refraction(

@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -418,12 +418,44 @@ def make_films(
     z = np.clip(z, *context.wide.z_range_nm)
     theta = np.column_stack([x, y, z, context.wide.scale.amplitudes(mass)])
     of_row = numbers[known].to_numpy()
-    seen = [
-        _Seen(model, frame[mine], theta[mine])
+    particles = [
+        (model, frame[mine], theta[mine])
         for track, model in _models(context, tracks).items()
         if (mine := of_row == track).any()
     ]
-    return tuple(_film(context, movie, camera, windows, seen, *film) for film in chosen)
+
+    def single(frame: int) -> Windows:
+        """Give one frame and its background, scaled to the power of the frame."""
+        spans = ((w, w.frames_after) for w in windows)
+        here = next((w for w, (first, last) in spans if first <= frame < last), windows[0])
+        one = add_frames(here, camera, movie.read(frame, frame + 1), frame)
+        if not context.config.background.power_normalization:
+            return one
+        if background_mode(context.config) != "tracks":
+            return start_power(one)
+        before, after = np.split(here.power, [here.n_before])
+        power = float(after[frame - here.frames_after[0]] / before.sum())
+        return replace(one, power_ratio=power)
+
+    def film(track: int, why: str, shown: pd.DataFrame) -> Film:
+        """Draw data, model and residual of some frames of a track, with all particles in them."""
+        region, frames = _square(context, windows[0], shown), shown["frame"].to_numpy(int)
+        grid = PixelGrid.region(region.rows, region.columns, context.pixel_nm)
+        data, model, residual = np.zeros((3, len(frames), *region.shape))
+        for own, when, places in particles:
+            here = np.isin(when, frames)
+            model[np.searchsorted(frames, when[here])] += signals_within(own, grid, places[here])
+        for number, frame in enumerate(frames.tolist()):
+            likelihood = region_likelihood(context, single(frame), region, None)
+            data[number] = likelihood.measured_signal()
+            information = likelihood.signal_information(model[number])
+            residual[number] = (data[number] - model[number]) * np.sqrt(information)
+            if context.additive:
+                data[number] *= likelihood.data[2]
+                model[number] *= likelihood.data[2]
+        return Film(track, tuple(frames.tolist()), why, data, model, residual)
+
+    return tuple(film(*each) for each in chosen)
 
 
 def _models(context: AnalysisContext, tracks: pd.DataFrame) -> dict[int, ForwardModel]:
@@ -468,63 +500,6 @@ def _shown(rows: pd.DataFrame, worst: bool) -> pd.DataFrame:
         start = int(np.nanargmax(rows["chi2_reduced"].to_numpy(float))) - FILM_FRAMES // 2
     start = max(0, min(start, len(rows) - FILM_FRAMES))
     return rows.iloc[start : start + FILM_FRAMES]
-
-
-class _Seen(NamedTuple):
-    """A particle: its model, frames, and places in them [nm] with its amplitude, shape (n, 4)."""
-
-    model: ForwardModel
-    frame: NDArray[np.int64]
-    theta: FloatArray
-
-
-def _film(
-    context: AnalysisContext,
-    movie: FrameSource,
-    camera: Camera,
-    windows: Sequence[Windows],
-    seen: Sequence[_Seen],
-    track: int,
-    why: str,
-    shown: pd.DataFrame,
-) -> Film:
-    """Draw data, model and residual of some frames of a track, with all particles in them."""
-    region, frames = _square(context, windows[0], shown), shown["frame"].to_numpy(int)
-    grid = PixelGrid.region(region.rows, region.columns, context.pixel_nm)
-    data, model, residual = np.zeros((3, len(frames), *region.shape))
-    for particle in seen:
-        here = np.isin(particle.frame, frames)
-        place = np.searchsorted(frames, particle.frame[here])
-        model[place] += signals_within(particle.model, grid, particle.theta[here])
-    for number, frame in enumerate(frames.tolist()):
-        likelihood = region_likelihood(
-            context, _single(context, movie, camera, windows, frame), region, None
-        )
-        data[number] = likelihood.measured_signal()
-        information = likelihood.signal_information(model[number])
-        residual[number] = (data[number] - model[number]) * np.sqrt(information)
-        if context.additive:
-            data[number] *= likelihood.data[2]
-            model[number] *= likelihood.data[2]
-    return Film(track, tuple(frames.tolist()), why, data, model, residual)
-
-
-def _single(
-    context: AnalysisContext,
-    movie: FrameSource,
-    camera: Camera,
-    windows: Sequence[Windows],
-    frame: int,
-) -> Windows:
-    """Give one frame and its background, scaled to the power of the frame."""
-    here = next((w for w in windows if w.frames_after[0] <= frame < w.frames_after[1]), windows[0])
-    single = add_frames(here, camera, movie.read(frame, frame + 1), frame)
-    if not context.config.background.power_normalization:
-        return single
-    if background_mode(context.config) != "tracks":
-        return start_power(single)
-    before, after = np.split(here.power, [here.n_before])
-    return replace(single, power_ratio=float(after[frame - here.frames_after[0]] / before.sum()))
 
 
 def _square(context: AnalysisContext, windows: Windows, rows: pd.DataFrame) -> Region:
