@@ -28,6 +28,7 @@ from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.run import RESUMPTION_HINT, partial_folder
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline import analyse, fit_stack
+from iscat_analysis.records import silent
 from iscat_analysis.threads import threads
 from iscat_analysis.tracking.blocks import Block, combine_masses, join_tracks
 from iscat_analysis.tracking.frames import (
@@ -70,10 +71,6 @@ def _config(**track: Any) -> Config:
 
 def _unchecked(counts: Any, first: int) -> None:
     """Refuse nothing."""
-
-
-def _untold(stage: str, done: int, total: int) -> None:
-    """Tell nobody."""
 
 
 @pytest.fixture(scope="module")
@@ -229,20 +226,18 @@ def test_tracks_go_on_where_they_ended() -> None:
     assert [n.tolist() for n in numbers] == [[0, 1], [1, 0, 2], [1]]
 
 
-@pytest.mark.parametrize(("missed", "joined"), [(0, True), (3, True), (4, False)])
-def test_a_particle_may_be_missed_at_a_border(missed: int, joined: bool) -> None:
-    """By `track.memory_frames`, where it is not so slow that nobody else can be there."""
-    one = _block((0, 50), [(range(49), 0.0, 0.0, 40.0)])
-    two = _block((50, 90), [(range(49 + missed, 90), 500.0, 0.0, 40.0)])
+@pytest.mark.parametrize(
+    ("last", "begins", "x_nm", "joined"),
+    [(49, 49, 500.0, True), (49, 52, 500.0, True), (49, 53, 500.0, False), (30, 70, 30.0, True)],
+)
+def test_a_particle_may_be_missed_at_a_border(
+    last: int, begins: int, x_nm: float, joined: bool
+) -> None:
+    """By `track.memory_frames`; for longer where it is so slow that nobody else can be there."""
+    one = _block((0, 50), [(range(last), 0.0, 0.0, 40.0)])
+    two = _block((50, 90), [(range(begins, 90), x_nm, 0.0, 40.0)])
     numbers = join_tracks(_config(), [one, two])
     assert bool(numbers[0][0] == numbers[1][0]) is joined
-
-
-def test_a_particle_that_hardly_moves_may_be_missed_for_longer() -> None:
-    one = _block((0, 50), [(range(30), 0.0, 0.0, 40.0)])
-    two = _block((50, 90), [(range(70, 90), 30.0, 0.0, 40.0)])
-    numbers = join_tracks(_config(), [one, two])
-    assert numbers[0][0] == numbers[1][0]
 
 
 def test_particles_of_unlike_mass_keep_their_numbers_where_they_cross() -> None:
@@ -310,7 +305,7 @@ def _whole(counts: np.ndarray, config: Config) -> tuple[pd.DataFrame, pd.DataFra
     stack, camera = Stack(counts), Camera(gain_e_per_adu=GAIN)
     context = tracking_context(config, (counts.shape[1], counts.shape[2]), len(counts))
     with threads(2) as pool:
-        recording = Recording(stack, camera, _unchecked, pool, _untold)
+        recording = Recording(stack, camera, _unchecked, pool, silent)
         moving = find_rows_and_background(context, recording, (0, len(counts)))
     inside = moving.field.holds(moving.rows.theta)
     table = table_of_tracks(
@@ -338,7 +333,7 @@ def test_frames_are_kept_as_they_are_stored_where_one_gain_is_theirs(
     context = tracking_context(_config(), (24, 24), len(counts))
     electrons = camera.to_electrons(counts[4:])
     with threads(2) as pool:
-        recording = Recording(Stack(counts), camera, _unchecked, pool, _untold)
+        recording = Recording(Stack(counts), camera, _unchecked, pool, silent)
         field = load_field(context, recording, (4, 30))
         total, totals = field.total_e, field.frame_totals
     assert field.exposures.counts.dtype == kept
@@ -393,28 +388,11 @@ def test_tracks_and_masses_go_through_blocks(in_blocks: Any, wanderers: Wanderer
     assert abs(joined.mean()) < SIGMAS / math.sqrt(joined.size)
     assert abs(joined.std() - 1) < SIGMAS / math.sqrt(2 * joined.size)
     assert len(in_blocks.views) == len(in_blocks.tracks)
-
-
-def test_films_show_each_block_over_its_own_background(in_blocks: Any) -> None:
-    for film in in_blocks.films:
+    for film in in_blocks.films:  # each block over its own background
         assert abs(np.nanstd(film.residual) - 1) < 0.1
 
 
-# ---- memory, interrupts, resumption ----------------------------------------------------------
-
-
-def test_a_movie_longer_than_the_memory_is_followed_in_blocks(
-    movie: Path, monkeypatch: pytest.MonkeyPatch, in_blocks: Any
-) -> None:
-    """40 frames fit: the same as blocks of 40."""
-    monkeypatch.setattr(blocks_module, "BYTES", 64e6 / (40 * SHAPE[1] * SHAPE[2]) - 1e-3)
-    config = _config()
-    compute = config.compute.model_copy(update={"memory_limit_mb": 64})
-    with open_stack(movie) as stack:
-        found = analyse(stack, config.model_copy(update={"compute": compute}))
-    assert found.summary["blocks"]["number"] == 3
-    pd.testing.assert_frame_equal(found.table, in_blocks.table, check_exact=True)
-    pd.testing.assert_frame_equal(found.tracks, in_blocks.tracks, check_exact=True)
+# ---- interrupts, resumption ----------------------------------------------------------
 
 
 def _stop_at(share: float) -> Callable[[str, int, int], None]:

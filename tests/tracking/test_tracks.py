@@ -238,17 +238,13 @@ def test_a_slow_particle_that_is_lost_is_flagged_where_the_background_may_have_i
     assert whole["status"].tolist() == [TrackStatus.OK]
 
 
-def test_a_track_of_few_frames_has_a_mass_and_no_d() -> None:
+def test_few_frames_are_those_that_tell_how_a_track_moves() -> None:
+    """They have a mass and no D; of 40 positions at the border none tells, which is said."""
     rng = np.random.default_rng(8)
     found = describe_tracks(fits_of([walk(rng, 6, 0.3)], rng), SETUP).iloc[0]
     assert found["status"] == TrackStatus.FEW_FRAMES
     assert np.isnan(found["d_um2_s"])
     assert abs(found["mass_kda"] - 400) < SIGMAS * found["sigma_mass_kda"]
-
-
-def test_few_frames_are_those_that_tell_how_a_track_moves() -> None:
-    """Of 40 positions at the border none does, which is said: they are not fewer than ten."""
-    rng = np.random.default_rng(8)
     path = walk(rng, 40, 0.8, start_nm=(0.0, 5000.0))
     path[:, 0] = 30.0  # [nm] from the border, along which it goes 100 nm from frame to frame
     found = describe_tracks(fits_of([path], rng), SETUP).iloc[0]
@@ -378,56 +374,53 @@ def test_rows_without_a_track_belong_to_none() -> None:
     assert describe_tracks(fits, SETUP)["track"].tolist() == [1]
 
 
-def _timed(**camera: float) -> list[str]:
-    config = parse_config(
-        {"camera": {"pixel_size_nm": PIXEL_NM, **camera}, "fit": {"mode": "track"},
-         "background": {"frames": [0, 10]}}
-    )  # fmt: skip
-    return [found.text for found in judge_times(config, 100, "movie.tif")]
+def _timed(
+    frames: int = 100, *, track: int = 10, learnt: bool = False, **camera: float
+) -> list[str]:
+    """Judge the times of a movie, whose camera is that of 331 frames a second."""
+    config = parse_config({
+        "camera": {"pixel_size_nm": PIXEL_NM, **camera}, "fit": {"mode": "track"},
+        "background": {"method": "tracks"} if learnt else {"frames": [0, 10]},
+        "track": {"min_frames": track},
+    })  # fmt: skip
+    return [found.text for found in judge_times(config, frames, "movie.tif")]
 
 
-def test_an_exposure_longer_than_the_interval_is_refused() -> None:
+@pytest.mark.parametrize(
+    ("camera", "words"),
+    [
+        ({"frame_rate_hz": 331.0, "exposure_ms": 2.5e-3}, "in seconds, write 2.5,"),
+        ({"frame_rate_hz": 331.0, "exposure_ms": 1 / 331.0}, f"in seconds, write {1e3 / 331:g},"),
+        ({"frame_rate_hz": 331.0, "exposure_ms": 0.01}, None),
+        ({"frame_rate_hz": 331.0, "exposure_ms": 2.5}, None),
+        ({"exposure_ms": 2.5}, "camera.frame_rate_hz = 331.0"),
+        ({"frame_rate_hz": 331.0}, "camera.exposure_ms"),
+    ],
+)
+def test_a_wrong_or_missing_time_is_said_with_its_key(
+    camera: dict[str, float], words: str | None
+) -> None:
+    said = _timed(**camera)
+    assert len(said) == (words is not None)
+    assert words is None or words in said[0]
+
+
+def test_times_that_cannot_be_are_refused() -> None:
+    """Of a track longer than its movie it was said that nothing stands out of the noise."""
     with pytest.raises(ConfigError, match=r"exposure_ms = 4 is longer than the 3\.021 ms"):
         _timed(frame_rate_hz=331.0, exposure_ms=4.0)
-
-
-def test_an_exposure_in_seconds_is_named() -> None:
-    for exposure in (2.5e-3, 1 / 331.0):
-        (line,) = _timed(frame_rate_hz=331.0, exposure_ms=exposure)
-        assert f"in seconds, write {1e3 * exposure:g}," in line
-    assert _timed(frame_rate_hz=331.0, exposure_ms=0.01) == []
-
-
-def test_a_missing_frame_rate_and_exposure_are_said_with_their_keys() -> None:
-    assert _timed(frame_rate_hz=331.0, exposure_ms=2.5) == []
-    (line,) = _timed(exposure_ms=2.5)
-    assert "camera.frame_rate_hz = 331.0" in line
-    (line,) = _timed(frame_rate_hz=331.0)
-    assert "camera.exposure_ms" in line
+    assert not _timed(60, track=60, learnt=True, frame_rate_hz=331.0, exposure_ms=2.0)
+    with pytest.raises(ConfigError, match=r"track\.min_frames = 60 is more than the 59 frames of"):
+        _timed(59, track=60, learnt=True, frame_rate_hz=331.0, exposure_ms=2.0)
 
 
 def test_a_short_movie_is_said_with_what_it_can_tell() -> None:
-    config = parse_config({"camera": {"pixel_size_nm": 84.0, "frame_rate_hz": 331.0,
-                                      "exposure_ms": 2.0}, "fit": {"mode": "track"},
-                           "background": {"frames": [0, 10]}})  # fmt: skip
-    assert not judge_times(config, SHORT_MOVIE, "movie.tif")
-    (found,) = judge_times(config, 10, "movie.tif")
-    assert found.text.startswith(
-        "movie.tif: 10 frames tell no diffusion coefficient better than to 33 %"
-    )
-    (found,) = judge_times(config, 5, "movie.tif")
-    assert "track.min_frames = 10" in found.text
-
-
-def test_tracks_longer_than_the_movie_are_not_looked_for() -> None:
-    """It was said that nothing stands out of the noise."""
-    config = parse_config({"camera": {"pixel_size_nm": 84.0, "frame_rate_hz": 331.0,
-                                      "exposure_ms": 2.0}, "fit": {"mode": "track"},
-                           "background": {"method": "tracks"},
-                           "track": {"min_frames": 60}})  # fmt: skip
-    assert not judge_times(config, 60, "movie.tif")
-    with pytest.raises(ConfigError, match=r"track\.min_frames = 60 is more than the 59 frames of"):
-        judge_times(config, 59, "movie.tif")
+    camera = {"frame_rate_hz": 331.0, "exposure_ms": 2.0}
+    assert not _timed(SHORT_MOVIE, **camera)
+    (said,) = _timed(10, **camera)
+    assert said.startswith("movie.tif: 10 frames tell no diffusion coefficient better than to 33 %")
+    (said,) = _timed(5, **camera)
+    assert "track.min_frames = 10" in said
 
 
 def test_steps_that_are_not_linked_are_told() -> None:
