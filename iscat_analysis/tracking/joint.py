@@ -55,6 +55,7 @@ MOST_STEP_RATIO = 5.0
 _SETTLED = 0.1  # step of the background, in its own standard deviations, that is the last one
 _NEXT_STEP_SETTLED = 0.02  # the same, of the next step if it shrinks as the last one did
 _ROUGH_STEP = 2.0  # step that is the last one while particles are still being looked for
+_NEAR_STEP, _FAR_STEP = 0.5, 5.0  # one below the former after one above the latter: new rings
 _DAMPING = 0.01  # of Newton's step, at first and at least: by as much 1 − E is wrong
 _DAMPING_UP, _DAMPING_DOWN = 10.0, 0.25  # by what it changes where the turns grow, or shrink fast
 _MOST_STEPS = 40
@@ -148,7 +149,7 @@ def fit_jointly(
     # particle is then a step of many pixels together, which is small in each.
     if field.frames < 60:
         turns, least, foreseen = 5 * turns, least / 10, 0.0
-    length, change, damping = np.inf, 0.0, _DAMPING
+    largest, length, change, damping = 0.0, np.inf, 0.0, _DAMPING
     done, step = np.ones(len(rows.frame), dtype=bool), np.zeros(field.used.shape)
     for turn in range(turns):
         rows, found, done = field.fit(ground, rows, coarse=coarse)
@@ -168,7 +169,11 @@ def fit_jointly(
         before, change = change, float(np.abs(step / sigma)[field.used].max(initial=0.0))
         level = np.where(field.used, ground.level * np.exp(step), found.level)
         ground = BackgroundEstimate(level, power)
-        if change < least or change**2 < foreseen * before:
+        largest = max(largest, change)
+        if change < _NEAR_STEP and largest > _FAR_STEP and not coarse:
+            field.draw_anew()
+            largest = change
+        elif change < least or change**2 < foreseen * before:
             break
     if follow_level:
         rows = field.response.followed(rows, step)
