@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise, repeat
+from itertools import pairwise, product, repeat
 from typing import Any
 
 import numpy as np
@@ -414,20 +414,16 @@ def choose_tiles(
     # of what counts may take; the images and regions of its steps have the rest
     budget, per_frame = 0.63 * counts_budget(config), per_block / stride
     longest = int(_SPAN_BYTES // reader.frame_bytes)
-    best: tuple[float, tuple[int, int], int] | None = None
     rows, columns = reader.shape
-    for high in range(1, rows // smallest + 1):
-        for wide in range(1, columns // smallest + 1):
-            pixels = _largest(rows, high, side) * _largest(columns, wide, side)
-            room = min(int((budget / pixels - _TILE_BYTES) / per_frame), longest)
-            core = frames if room >= frames else (room - 2 * halo) // stride * stride
-            if core < stride:
-                continue
+    choices: list[tuple[float, tuple[int, int], int]] = []
+    for high, wide in product(range(1, rows // smallest + 1), range(1, columns // smallest + 1)):
+        pixels = _largest(rows, high, side) * _largest(columns, wide, side)
+        room = min(int((budget / pixels - _TILE_BYTES) / per_frame), longest)
+        core = frames if room >= frames else (room - 2 * halo) // stride * stride
+        if core >= stride:
             looked_at = (rows + 2 * side * (high - 1)) * (columns + 2 * side * (wide - 1))
-            work = looked_at * (min(core + 2 * halo, frames) / core)
-            if best is None or work < best[0]:
-                best = work, (high, wide), core
-    if best is None:
+            choices.append((looked_at * min(core + 2 * halo, frames) / core, (high, wide), core))
+    if not choices:
         needed = min(2 * halo + stride, frames)
         if needed > longest:
             raise DataError(
@@ -435,16 +431,16 @@ def choose_tiles(
                 f"{_SPAN_BYTES / 1e9:g} GB hold {longest} of {columns} x {rows} pixels: lower "
                 "background.window_frames, or cut the field"
             )
-        pixels = (smallest + 2 * side) ** 2
-        least = (
-            config.compute.memory_limit_mb * pixels * (_TILE_BYTES + per_frame * needed) / budget
-        )
+        of_pixel = _TILE_BYTES + per_frame * needed
+        share = (smallest + 2 * side) ** 2 * of_pixel / budget
+        least = config.compute.memory_limit_mb * share
         raise DataError(
             f"{reader.name}: windows of {window} frames of {columns} x {rows} pixels need "
             f"compute.memory_limit_mb = {math.ceil(least)}; raise it, or lower "
             "background.window_frames"
         )
-    return best[1], best[2]
+    _, tiles, core = min(choices, key=lambda choice: choice[0])
+    return tiles, core
 
 
 def _largest(size: int, parts: int, halo: int) -> int:

@@ -28,7 +28,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, NamedTuple
@@ -116,7 +116,7 @@ def extended(
             last = frames[end.frame]
             near = [j for j in frames[t] if _apart(frames[t][j], last[k]) < meeting_nm]
             for j in (k, *near):
-                starts[j] = last.get(j, frames[t].get(j)).copy()  # type: ignore[union-attr]
+                starts[j] = (last if j in last else frames[t])[j].copy()
                 starts[j][3] = typical[j]
         return starts
 
@@ -143,7 +143,10 @@ def extended(
         if not proposed:
             break
         starts = {t: with_neighbours(t, new) for t, new in proposed.items()}
-        fitted, done = field.refit(ground, _rows_of(starts, blur), sweeps=6)
+        keys = np.array([(t, k) for t, rows_of in starts.items() for k in rows_of], dtype=np.int64)
+        theta = np.array([start for rows_of in starts.values() for start in rows_of.values()])
+        trial = Localizations.of(*keys.T, theta, blur[keys[:, 1]])
+        fitted, done = field.refit(ground, trial, sweeps=6)
         good = done & (fitted.snr > LEAST_SNR)
         ends = []
         for t, new in proposed.items():
@@ -155,23 +158,14 @@ def extended(
             if accepted:
                 there = {k: v for k, v in there.items() if k in frames[t] or k in accepted}
                 frames[t].update(there)
-                refitted[t] = fitted.only(of_frame)
+                refitted[t] = fitted.only(of_frame & np.isin(fitted.track, [*there]))
                 ends += [_End(k, t, new[k].direction) for k in accepted]
         added += len(ends)
     rows = replace(rows, group=blur[rows.track])
     if not refitted:
         return rows, 0
-    changed = _rows_of({t: frames[t] for t in refitted}, blur).recalling(rows)
-    changed = changed.recalling(Localizations.together([refitted[t] for t in sorted(refitted)]))
-    others = rows.only(~np.isin(rows.frame, changed.frame))
-    return Localizations.together([others, changed]).in_order(), added
-
-
-def _rows_of(frames: Mapping[int, Mapping[int, FloatArray]], blur: IntArray) -> Localizations:
-    """Make rows of parameters by frame and track."""
-    keys = np.array([(t, k) for t, there in frames.items() for k in there], dtype=np.int64)
-    theta = np.array([theta for there in frames.values() for theta in there.values()])
-    return Localizations.of(keys[:, 0], keys[:, 1], theta, blur[keys[:, 1]])
+    others = rows.only(~np.isin(rows.frame, [*refitted]))
+    return Localizations.together([others, *refitted.values()]).in_order(), added
 
 
 OUTLYING = 5.0
@@ -313,6 +307,7 @@ def extrapolated(
 def trimmed(rows: Localizations) -> Localizations:
     """Cut frames with too little mass off both ends of tracks."""
     light = pd.Series(rows.theta[:, 3] > LEAST_SHARE * typical(rows).theta[:, 3])
+    light |= ~light.groupby(rows.track).transform("any")
     begun = light.groupby(rows.track).cummax()
     goes_on = light[::-1].groupby(rows.track[::-1]).cummax()[::-1]
     return rows.only((begun & goes_on).to_numpy())

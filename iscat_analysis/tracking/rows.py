@@ -70,16 +70,6 @@ class Localizations:
         """Set estimates, informations and gains in log-likelihood."""
         return replace(self, theta=theta, fisher=fisher, snr=np.sqrt(2 * np.maximum(gain, 0.0)))
 
-    def recalling(self, old: Localizations) -> Localizations:
-        """Copy the fits of rows that are the same in others."""
-        many = int(max(self.track.max(initial=0), old.track.max(initial=0))) + 1
-        keys, sought = old.frame * many + old.track, self.frame * many + self.track
-        where = np.minimum(np.searchsorted(keys, sought), len(keys) - 1)
-        same = (keys[where] == sought) & (old.theta[where] == self.theta).all(axis=1)
-        fisher, snr = self.fisher.copy(), self.snr.copy()
-        fisher[same], snr[same] = old.fisher[where[same]], old.snr[where[same]]
-        return replace(self, fisher=fisher, snr=snr)
-
     def starts(self, frames: int) -> IntArray:
         """Index of the first row of each frame, and the number of rows."""
         first: IntArray = np.searchsorted(self.frame, np.arange(frames + 1)).astype(np.int64)

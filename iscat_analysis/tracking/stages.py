@@ -215,15 +215,6 @@ class Task:
         """Whether particles move along z as well."""
         return bool(self.field.free[2])
 
-    @property
-    def learns_background(self) -> bool:
-        """Whether the background follows the rows."""
-        return self.config.background.learnt_with_tracks
-
-    def linked(self, rows: Localizations, *, bridged: bool = False) -> Localizations:
-        """Link rows by their places and masses."""
-        return linked(self.config, rows, bridged=bridged, inner=self.inner)
-
     def fitted(self, state: State, turns: int = MOST_TURNS, *, coarse: bool = True) -> State:
         """Fit rows and background in turn."""
         ways = self.config.background
@@ -310,12 +301,14 @@ def search(task: Task, state: State) -> State:
             state = replace(state, rows=rows, done=done)
         state = replace(state, rows=_credible(task, state.rows, state.done))
         if task.heights_free and number == 0:  # sharp pictures leave over of gold what is seen
-            state = task.blurred(replace(state, rows=task.linked(state.rows)))
+            state = task.blurred(
+                replace(state, rows=linked(task.config, state.rows, inner=task.inner))
+            )
             state = task.fitted(state, _NEXT_TURNS)
         _refuse_flood(task, state.rows)
         if number and len(state.rows.frame) <= (1 + _FEW) * before:
             break
-    return replace(state, rows=task.linked(state.rows))
+    return replace(state, rows=linked(task.config, state.rows, inner=task.inner))
 
 
 def extend(task: Task, state: State) -> State:
@@ -329,13 +322,15 @@ def extend(task: Task, state: State) -> State:
             rows, added = extended(
                 task.field, state.ground, rows, resolution_nm=near_nm, reach_nm=reach_nm
             )
-        rows = alone(task.context, task.linked(rows, bridged=True), inner=task.inner)
+        rows = linked(task.config, rows, bridged=True, inner=task.inner)
+        rows = alone(task.context, rows, inner=task.inner)
         # in two rounds slow particles are tried where they were not detected
         ground, trial = state.ground, number < 2
-        if trial and task.learns_background and not task.cautious:
+        learns = task.config.background.learnt_with_tracks
+        if trial and learns and not task.cautious:
             rows, tried = extrapolated(task.config, task.field, rows)
             added += tried
-        if task.learns_background:  # of all frames, before these are fitted over it
+        if learns:  # of all frames, before these are fitted over it
             _, found, _ = task.field.fit(ground, typical(rows), sweeps=0, coarse=True)
             ground = replace(ground, level=found.level)
         state = replace(state, rows=rows, ground=ground)

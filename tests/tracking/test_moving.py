@@ -319,27 +319,6 @@ def test_rows_know_what_their_last_fit_saw(pool: ThreadPoolExecutor) -> None:
     assert np.all((smaller > 0.7) & (smaller < 1.0))
 
 
-def test_only_rows_that_are_the_same_recall_their_fits(pool: ThreadPoolExecutor) -> None:
-    counts, ground, truth = _movie(_paths(40.0), noise=True)
-    fitted, _, _ = _field(counts, pool).fit(ground, truth)
-    theta = fitted.theta.copy()
-    theta[7, 0] += 1e-9
-    track = np.where(np.arange(len(theta)) == 4, 2, fitted.track)
-    again = Localizations.of(fitted.frame, track, theta).joined(
-        np.array([5]), np.array([3]), theta[:1], np.array([0])
-    )
-    recalled = again.recalling(fitted)
-    new = np.isnan(recalled.snr)
-    assert new.sum() == 3
-    assert set(zip(recalled.frame[new], recalled.track[new], strict=True)) == {
-        (2, 2), (3, 1), (5, 3),
-    }  # fmt: skip
-    kept = recalled.only(~new)
-    same = np.isin(np.arange(len(theta)), [4, 7], invert=True)
-    assert np.array_equal(kept.snr, fitted.snr[same])
-    assert np.array_equal(kept.fisher, fitted.fisher[same])
-
-
 @pytest.mark.parametrize("beside_nm", [None, 320.0])
 def test_rows_follow_a_step_of_their_background(
     pool: ThreadPoolExecutor, beside_nm: float | None
