@@ -21,7 +21,6 @@ from iscat_analysis.records.columns import (
 )
 from iscat_analysis.records.rows import (
     POOR_P,
-    Tally,
     counted,
     flagged,
     has_flag,
@@ -93,7 +92,6 @@ __all__ = [
     "Provenance",
     "StackMetadata",
     "Status",
-    "Tally",
     "Trace",
     "TrackStatus",
     "Windows",

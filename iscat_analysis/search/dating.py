@@ -61,8 +61,8 @@ class Rise:
 
 def find_rise(
     heights: FloatArray, weight: FloatArray, turn: int, step: float, expected: int = 0
-) -> tuple[Rise | None, tuple[float, ...]]:
-    """Find a rise around the best step, whose log-likelihood is given; None where it is a step.
+) -> tuple[Rise, tuple[float, ...]]:
+    """Find a rise around the best step, whose log-likelihood is given; of 0 frames if it is one.
 
     A course other than the expected one, which is a step if no frames of a rise are expected, must
     be clearly better.  The gains of all lines over the step are given as well, for `common_rise`.
@@ -95,7 +95,7 @@ def find_rise(
         best = max([best, *near])
     gain, rise, centre = best
     if not rise:
-        return None, profile
+        return Rise(0, turn, 0.0, 1.0, ()), profile
     begins = centre - rise / 2 + rise * np.linspace(-0.25, 0.25, 11)
     curves = [_settling(lit, rise * share, begins[:, None]) for share in _DECAY_SHARES]
     settling = tuple(float(_gains(curve, w, y).max()) - gain for curve in curves)
@@ -260,7 +260,7 @@ def locate_step(
     sides = slice(0, max(turn - gap, 0)), slice(min(turn + gap, heights.size), heights.size)
     for side in sides:
         weight[side] /= _noise_ratio(patch, image, side)
-    if rise is None:
+    if not rise.frames:
         p = min(_p_constant(heights[side], weight[side]) for side in sides)
     else:
         turn, height = rise.centre, rise.height
@@ -269,11 +269,8 @@ def locate_step(
         straight = heights - height * line(np.arange(heights.size), rise.frames, turn)
         p = min(_p_constant(straight, weight), rise.p_line)
         half_width = max(half_width, rise.frames // 2)
-    p = 1 - (1 - p) ** 2
-    frame = patch.first + turn
-    if rise is None:
-        return StepFrame(frame, half_width, height, snr, p, rise_profile=profile)
-    return StepFrame(frame, half_width, height, snr, p, rise.frames, profile, rise.settling)
+    p, course = 1 - (1 - p) ** 2, (rise.frames, profile, rise.settling)
+    return StepFrame(patch.first + turn, half_width, height, snr, p, *course)
 
 
 def frame_heights(patch: Patch, image: FloatArray) -> tuple[FloatArray, FloatArray, float]:
