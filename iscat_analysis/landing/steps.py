@@ -224,7 +224,7 @@ class ChunkFitter:
 
     def _is_near_core(self, step: Step, margin_px: float) -> bool:
         """Whether a step is in the core of a tile, or nearer to it than a margin."""
-        return is_within(self.own, step.start.y_px, step.start.x_px, margin_px)
+        return bool(is_within(self.own, step.start.y_px, step.start.x_px, margin_px))
 
     def _improve(
         self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]

@@ -145,7 +145,8 @@ def extended(
         starts = {t: with_neighbours(t, new) for t, new in proposed.items()}
         keys = np.array([(t, k) for t, rows_of in starts.items() for k in rows_of], dtype=np.int64)
         theta = np.array([start for rows_of in starts.values() for start in rows_of.values()])
-        trial = Localizations.of(*keys.T, theta, blur[keys[:, 1]])
+        frame, track = keys.T
+        trial = Localizations.of(frame, track, theta, blur[track])
         fitted, done = field.refit(ground, trial, sweeps=6)
         good = done & (fitted.snr > LEAST_SNR)
         ends = []
