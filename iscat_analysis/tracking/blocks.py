@@ -73,13 +73,6 @@ LEAST_FRAMES = 20
 MOST_TRACKS = 16
 """The brightest are looked at."""
 
-MOST_SINGLE = 36
-"""Frames of their own that are looked at: each has a height that is searched."""
-
-MOST_SMEARED_NM = 25.0
-"""Spread of the path in a frame of its own that is looked at: of a longer one the picture is no
-longer that of a normal distribution about the mean."""
-
 
 @dataclass(frozen=True)
 class Aligned:
@@ -134,16 +127,17 @@ def align(context: AnalysisContext, moving: TrackedRows) -> Aligned:
     heights_free = bool(field.free[2])
     good = moving.done & ~moving.close & field.holds(rows.theta)
     if heights_free:
-        good &= (rows.snr > FAINTEST) & (moving.smear_nm < MOST_SMEARED_NM)
+        # of a path longer than 25 nm the picture is no longer that of a normal distribution
+        good &= (rows.snr > FAINTEST) & (moving.smear_nm < 25.0)
     else:
         good &= np.isfinite(moving.common.amplitude)[rows.track]
     chosen = np.flatnonzero(_brightest(rows.track, rows.snr, good))
     if not len(chosen):
         empty, nothing = np.zeros((0, side, side)), np.zeros(0, dtype=np.int64)
         return Aligned(nothing, empty, empty, empty, np.zeros((0, 5)), nothing)
-    if heights_free:  # from all heights alike
+    if heights_free:  # 36 from all heights alike: each has a height that is searched
         ranked = chosen[np.argsort(rows.theta[chosen, 2], kind="stable")]
-        some = np.linspace(0, len(ranked) - 1, min(MOST_SINGLE, len(ranked))).round().astype(int)
+        some = np.linspace(0, len(ranked) - 1, min(36, len(ranked))).round().astype(int)
         chosen = np.sort(ranked[some])
     places, track = rows.theta[chosen, :2] / pixel, rows.track[chosen]
     whole = np.rint(places).astype(np.int64)

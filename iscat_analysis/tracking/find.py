@@ -83,12 +83,6 @@ from iscat_analysis.tracking.table import loss_to_blur, moving_table
 from iscat_analysis.tracking.tracks import mass_correlation
 from iscat_analysis.trust.null_field import FrameNoise
 
-MOST_REJECTED = 0.5
-"""Share of the rows with free heights beyond which these are doubted."""
-
-FEW_REJECTED = 0.25
-"""Share of the rows at one height up to which it describes them: of membranes a hundredth is."""
-
 _REJECTED = "|".join([Status.NOT_CONVERGED, Status.AT_BOUND, Status.POOR_FIT])
 
 
@@ -100,7 +94,7 @@ def held_height_warning(
         return None
     first, last = span[0], min(span[1], span[0] + 200)
     free = _rejected(fits[fits["frame"].between(first, last - 1)])
-    if free.size == 0 or free.mean() <= MOST_REJECTED:
+    if free.size == 0 or free.mean() <= 0.5:
         return None
     track = config.track.model_copy(update={"free": "mass"})
     config, movie = config.model_copy(update={"track": track}), recording.movie
@@ -111,7 +105,8 @@ def held_height_warning(
     except DataError:  # nothing can be followed at one height
         return None
     held = _rejected(moving_table(context, moving, first)[moving.field.holds(moving.rows.theta)])
-    if held.size < 30 or 2 * held.size < free.size or held.mean() > FEW_REJECTED:  # rows that tell
+    # 30 rows tell; of membranes a hundredth of the rows is not described at their height
+    if held.size < 30 or 2 * held.size < free.size or held.mean() > 0.25:
         return None
     values = {"free": int(free.sum()), "free_of": free.size, "fixed": int(held.sum())}
     height = {"fixed_of": held.size, "height_nm": context.model.height_nm}

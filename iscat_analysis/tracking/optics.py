@@ -40,9 +40,6 @@ ROUNDS = 8
 """Of optics learned from tracks, and tracks followed with them, at most.  What is learned from
 tracks that were followed with wrong optics is only near the truth, as `instrument.loop` says."""
 
-_NOISE = "the noise is not what the camera's numbers predict, and may be what is left over"
-_NO_BETTER = "what was learned does not describe them either"
-
 
 @dataclass(frozen=True)
 class Misfit:
@@ -118,7 +115,8 @@ def learn_from_tracks(
     cause = _cause(begun) if left.rejected else None
     noisy = begun.block.noise_differs and trouble is None
     if noisy and cause is None and optics.calibrate != "always":
-        return begun, tested | {"calibrated": False, "reason": _NOISE}
+        reason = "the noise is not what the camera's numbers predict, and may be what is left over"
+        return begun, tested | {"calibrated": False, "reason": reason}
 
     def as_configured(message: str, reason: str) -> tuple[TrialTracks, dict[str, Any]]:
         if trouble is not None and cause is None:
@@ -149,7 +147,8 @@ def learn_from_tracks(
                 )
                 run.report(*findings)
                 return begin(learned), told
-            why = next((one.reason for one in reversed(rounds.all) if one.reason), _NO_BETTER)
+            reasons = [one.reason for one in rounds.all if one.reason]
+            why = reasons[-1] if reasons else "what was learned does not describe them either"
             last = tracks.begun
             if trouble is not None and last.left is not None and tracks.described:
                 run.report(TRACKS_HALF_DESCRIBED({"verdict": left.verdict, "why": why}))

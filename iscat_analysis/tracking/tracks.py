@@ -73,10 +73,6 @@ MANY_FRAMES_MISSING = 8
 """Frames missing at once, which are not the run of two or three where single ones are dropped."""
 
 _UNLIKELY = 8.0  # of log-likelihood: one good movie in e⁸ at most
-_GAPS = (2, 3, 5, 8, 13, 20, 30, 50, 80)
-_LONGEST = 4.0  # standard deviations of a step that counts
-_CLIPPED = 4.0  # |step|²/2v: no single particle, which may be lost, decides over all
-_SHARES = np.linspace(0.005, 0.5, 100)
 
 
 @dataclass(frozen=True)
@@ -144,7 +140,8 @@ def _shared_steps(steps: _Steps, frame_rate_hz: float | None) -> Finding | None:
     The variance of the common step is the mean product of the steps of two different particles.
     """
     length = np.hypot(*steps.step.T) / np.sqrt(steps.variance)
-    cut = steps.step * np.minimum(1, _LONGEST / np.maximum(length, _LONGEST))[:, None]
+    # a step counts as if it were of 4 standard deviations at most
+    cut = steps.step / np.maximum(length / 4.0, 1.0)[:, None]
     weight = 1 / steps.variance
     both = [steps.total(weight * cut[:, k]) ** 2 for k in (0, 1)]
     own = steps.total(weight**2 * (cut**2).sum(axis=1))
@@ -172,9 +169,9 @@ def _jumps(steps: _Steps) -> list[tuple[int, Finding]]:
     surprise, particles = _normalized_squares(steps)
     total, largest = steps.total(surprise), np.zeros(len(particles))
     np.maximum.at(largest, steps.frame, surprise)
-    gaps = np.array(_GAPS)[:, None]
+    gaps = np.array([2, 3, 5, 8, 13, 20, 30, 50, 80])[:, None]
     gain = total * (1 - 1 / gaps) - particles * np.log(gaps)
-    most, missing = gain.max(axis=0), np.array(_GAPS)[gain.argmax(axis=0)] - 1
+    most, missing = gain.max(axis=0), gaps[gain.argmax(axis=0), 0] - 1
     rest = (total - largest) * (1 - 1 / gaps) - (particles - 1) * np.log(gaps)
     others = rest.max(axis=0)
     # 7.0 of log-likelihood without the farthest particle, which may be another
@@ -190,16 +187,18 @@ def _jumps(steps: _Steps) -> list[tuple[int, Finding]]:
 def _dropped(steps: _Steps) -> Finding | None:
     """Find whether many single frames are missing."""
     surprise, particles = _normalized_squares(steps)
-    clipped = np.minimum(surprise, _CLIPPED)
+    most = 4.0  # |step|²/2v: no single particle, which may be lost, decides over all
+    clipped = np.minimum(surprise, most)
     # mean of exp(½ min(e, c)) over e of mean 1: what the clipped odds must be divided by
-    norm = 2 - math.exp(-_CLIPPED / 2)
+    norm = 2 - math.exp(-most / 2)
     gain = steps.total(clipped) / 2 - particles * math.log(norm)
     odds = np.exp(np.minimum(gain, 50.0))
-    likely = np.log1p(_SHARES[:, None] * (odds - 1)).sum(axis=1)
+    shares = np.linspace(0.005, 0.5, 100)
+    likely = np.log1p(shares[:, None] * (odds - 1)).sum(axis=1)
     best = int(np.argmax(likely))
     if likely[best] < _UNLIKELY:
         return None
-    return FRAMES_SEEM_DROPPED({"pairs": len(particles), "share": float(_SHARES[best])})
+    return FRAMES_SEEM_DROPPED({"pairs": len(particles), "share": float(shares[best])})
 
 
 SHORT_MOVIE = 20
