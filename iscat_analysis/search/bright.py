@@ -32,8 +32,6 @@ from iscat_analysis.search.frames import Chunk
 from iscat_analysis.search.peaks import maxima
 from iscat_analysis.search.sliding import STRIDES
 
-_REACH = 4.0  # standard deviations, beyond which the spot is cut off
-
 T = TypeVar("T", np.float32, np.float64)
 
 
@@ -49,7 +47,7 @@ def spot_response(shape: tuple[int, ...], sigma_px: float) -> NDArray[np.float64
 @lru_cache(maxsize=16)
 def _along(length: int, sigma_px: float) -> NDArray[np.float64]:
     """Response along one axis."""
-    place = np.arange(1, math.floor(_REACH * sigma_px + 0.5) + 1)
+    place = np.arange(1, math.floor(4.0 * sigma_px + 0.5) + 1)  # beyond, the spot is cut off
     weight = np.exp(-0.5 * (place / sigma_px) ** 2)
     waves = np.cos(np.pi * np.multiply.outer(np.arange(length), place) / length)
     return np.asarray((1 + 2 * waves @ weight) / (1 + 2 * weight.sum()))

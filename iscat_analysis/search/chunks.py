@@ -43,7 +43,6 @@ from iscat_analysis.threads import threads
 NOISE_FRAMES = 800
 """Frames on which the noise is judged, and the windows are chosen."""
 
-_LEVEL_FRAMES = 24  # frames all over a movie, that tell how much light there is
 MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
 _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is copied and looked at
 
@@ -318,7 +317,8 @@ def reader_of(movie: CountSource, config: Config, camera: Camera, span: tuple[in
     """Read frames of a landing movie."""
     dark_e = -math.inf
     if config.optics.interferes and span[0] < span[1]:
-        numbers = np.linspace(span[0], span[1] - 1, _LEVEL_FRAMES).astype(int).tolist()
+        # 24 frames all over a movie tell how much light there is
+        numbers = np.linspace(span[0], span[1] - 1, 24).astype(int).tolist()
         seen, theirs = sampled(movie, camera)
         some = np.concatenate([seen.read(k, k + 1) for k in numbers])
         light = measure_frames(some, theirs)[0]
@@ -371,8 +371,8 @@ def plan_parts(
     if not core:
         parts, core = choose_tiles(reader, config, window, last - first, in_place=in_place)
         tiles = cut_field(reader.shape, parts, halo_px(config))
-    count = math.ceil((last - first) / core)
-    even = math.ceil((last - first) / count / stride) * stride
+    count = max(math.ceil((last - first) / core), 1)
+    even = max(math.ceil((last - first) / count / stride), 1) * stride
     # tiles of a movie, or some more, tell enough of the noise where nothing lands
     every = max(1, count * len(tiles) // 16) if tiles[0] else 1
     return [
@@ -462,7 +462,7 @@ def plan_chunks(reader: Reader, config: Config, window: int, frames: int) -> int
     per_block = _SUM_BYTES + _MAP_BYTES + _HIGHEST_BYTES + _moving_bytes(config)
     buffers_bytes = per_block * pixels // stride
     if frames * (reader.frame_bytes + buffers_bytes) <= budget:
-        return frames
+        return max(frames, 1)
     core = (budget // (reader.held_bytes + buffers_bytes) - 2 * halo) // stride * stride
     return core if core >= max(halo, stride) else 0  # else most of the work would be that of halos
 

@@ -33,7 +33,6 @@ IntArray = NDArray[np.int64]
 _LEAST_GAIN = 6.0  # log-likelihood by which another course is better than the expected one
 _ALONE = 0.1  # probability that a step has a course of its own
 _RISE_FRAMES = (3, 5, 8, 12, 18, 27, 40, 60, 90)  # tried first, then others near the best
-_DECAY_SHARES = (0.15, 0.25, 0.35, 0.5, 0.7)  # over the frames of the line
 
 
 @dataclass(frozen=True)
@@ -97,7 +96,8 @@ def find_rise(
     if not rise:
         return Rise(0, turn, 0.0, 1.0, ()), profile
     begins = centre - rise / 2 + rise * np.linspace(-0.25, 0.25, 11)
-    curves = [_settling(lit, rise * share, begins[:, None]) for share in _DECAY_SHARES]
+    shares = (0.15, 0.25, 0.35, 0.5, 0.7)  # of the frames of the line, that the light decays in
+    curves = [_settling(lit, rise * share, begins[:, None]) for share in shares]
     settling = tuple(float(_gains(curve, w, y).max()) - gain for curve in curves)
     p_line = float(erfc(np.sqrt(max(*settling, 0.0))))  # of χ² with one degree of freedom
     height = _gain_beyond(heights, weight, centre, rise // 2 + 1)

@@ -28,8 +28,6 @@ and n/2 frames on one side."""
 FEWEST_PLACES = 60
 """Places below which nothing is said."""
 
-_TRIM_SIGMAS = 4.0  # robust standard deviations beyond which something else than noise is there
-_KEPT_VARIANCE = 0.998929  # of a normal law inside ±_TRIM standard deviations
 _LEAST_LEFT = 0.5  # share of a variance; less is left only next to fits, where nothing is measured
 
 
@@ -185,10 +183,11 @@ class EmptyField:
             noise = noise * left[:, kept]
         whole = (means[1] - means[0]) / np.sqrt(noise)
         scale = SIGMA_PER_MAD * np.median(np.abs(whole), axis=1, keepdims=True)
-        quiet = np.all(np.abs(whole) < _TRIM_SIGMAS * scale, axis=0)
+        # beyond 4 robust standard deviations something else than noise is there
+        quiet = np.all(np.abs(whole) < 4.0 * scale, axis=0)
         if quiet.sum() < FEWEST_PLACES:
             return nothing
-        found = [(whole**2 / _KEPT_VARIANCE, 1)]
+        found = [(whole**2 / 0.998929, 1)]  # the variance of a normal law inside that
         parts_squares, degrees = np.zeros(unit.shape), 0
         for power, parts, mean in zip(powers, sides, means, strict=True):
             for light, part in zip(power, parts, strict=True):

@@ -14,18 +14,11 @@ from iscat_analysis.camera import Camera
 from iscat_analysis.medians import robust_sigma
 from iscat_analysis.records import FloatArray
 
-LONGEST_WINDOW = 100
-"""Frames that a window chosen from the noise may have; beyond it events overlap too often."""
-
 SHORTEST_WINDOW = 10
 """Frames that it must have at least."""
 
 SHORTEST_MOVIE = 4 * SHORTEST_WINDOW
 """Frames of the shortest movie for which windows are chosen."""
-
-MOVIE_SHARE = 10
-"""A window chosen from the noise takes at most this part of the movie."""
-
 
 _LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100)
 _PARTS = 4  # of a field, which a pattern that moves has in common
@@ -187,5 +180,5 @@ def choose_window(curve: NoiseCurve, frames: int) -> int:
 
 
 def longest_window(frames: int) -> int:
-    """Longest window that is chosen for a movie."""
-    return max(SHORTEST_WINDOW, min(LONGEST_WINDOW, frames // MOVIE_SHARE))
+    """Longest window that is chosen for a movie: a tenth of it, in which events seldom overlap."""
+    return max(SHORTEST_WINDOW, min(100, frames // 10))
