@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt, model_validator
 
 from iscat_analysis.config.instrument import MEASURABLE, Optics, OpticsCovariance
 from iscat_analysis.config.kinds import METHODS, MODES, ModeKind, Way
 from iscat_analysis.config.values import (
     ALL,
     LARGEST_NM,
+    FillFactor,
     Finite,
     FrameRange,
     FramesOrAll,
+    Height,
     Method,
     Mode,
     NonNegative,
     Positive,
+    Samples,
     Section,
     SphereKind,
     length,
@@ -25,6 +28,8 @@ from iscat_analysis.config.values import (
 
 DIAMETERS_NM = (2.0, 2000.0)
 """Range of diameters of the spheres that mode size may search."""
+
+FittedDiameter = Annotated[Positive, length(*DIAMETERS_NM)]
 
 
 TEMPERATURES_C = (-100.0, 250.0)
@@ -140,14 +145,9 @@ class Fit(Section):
     """fit two equal halves to every particle, and give extended ones their mass"""
     index: bool = False
     """mode size: fit the refractive index too, where the picture tells it"""
-    z_range_nm: tuple[
-        Annotated[NonNegative, length(0.0, LARGEST_NM)],
-        Annotated[NonNegative, length(0.0, LARGEST_NM)],
-    ] = (0.0, 1000.0)
+    z_range_nm: tuple[Height, Height] = (0.0, 1000.0)
     """bounds of z if it is free"""
-    diameter_range_nm: tuple[
-        Annotated[Positive, length(*DIAMETERS_NM)], Annotated[Positive, length(*DIAMETERS_NM)]
-    ] = (10.0, 400.0)
+    diameter_range_nm: tuple[FittedDiameter, FittedDiameter] = (10.0, 400.0)
     """bounds of the diameter in mode size, and of spheres"""
     # Materials of spheres that are tried, at most
     spheres: Annotated[tuple[SphereKind, ...], Field(max_length=32)] = (
@@ -228,7 +228,7 @@ class TrackConfig(Section):
     """largest distance of a particle from one frame to the next"""
     memory_frames: Annotated[int, Field(ge=0, le=1000)] = 3
     """frames in which a particle may be missed without ending its track"""
-    min_frames: Annotated[int, Field(ge=1)] = 10
+    min_frames: PositiveInt = 10
     """shorter tracks are left out"""
     block_frames: Literal["auto"] | Annotated[int, Field(ge=20)] = "auto"
     """longest block of frames with one background; tracks continue from block to block | "auto": as
@@ -272,7 +272,7 @@ class Compute(Section):
     """threads"""
     memory_limit_mb: Annotated[int, Field(ge=64)] = 1000
     """for the pixel data held at once"""
-    seed: Annotated[int, Field(ge=0)] = 1
+    seed: NonNegativeInt = 1
     """of random numbers: posteriors, injected particles, resampled species"""
 
 
@@ -286,9 +286,9 @@ class StandardsCamera(Section):
 
     pixel_size_nm: Positive | None = None
     """in the sample plane"""
-    samples_per_pixel: Literal["auto"] | Annotated[int, Field(ge=1, le=9)] = 1
+    samples_per_pixel: Samples = 1
     """along each axis, with which the standards were analysed"""
-    fill_factor: Annotated[float, Field(gt=0, le=1)] = 1.0
+    fill_factor: FillFactor = 1.0
     """share of a pixel's area that detects light"""
     gain_e_per_adu: Positive | None = None
     """photoelectrons per count, where it is one number"""
@@ -313,13 +313,13 @@ class Calibration(Section):
     """standard error of offset"""
     correlation: Annotated[float, Field(ge=-1, le=1)] = 0.0
     """of the errors of gradient_per_kda and offset"""
-    dof: Annotated[int, Field(ge=0)] | None = None
+    dof: NonNegativeInt | None = None
     """degrees of freedom of the line: standards beyond two"""
     optics: Optics | None = None
     """keys of [optics] with which the standards were analysed"""
     covariance: OpticsCovariance | None = None
     """of these if they were learned, { names, matrix }"""
-    height_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = None
+    height_nm: Height | None = None
     """particle.height_nm with which the standards were analysed"""
     camera: StandardsCamera | None = None
     """with which they were recorded"""

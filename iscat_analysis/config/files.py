@@ -14,10 +14,9 @@ import tomllib
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, TypeAlias, get_args
+from typing import Any, TypeAlias, TypeVar, get_args
 
 from pydantic import ValidationError
 
@@ -30,6 +29,8 @@ from iscat_analysis.config.values import ALL, Section
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.reading import LARGEST_TEMPLATE_BYTES, read_bytes, read_text, toml_of
 from iscat_analysis.text import in_toml
+
+S = TypeVar("S", bound=Section)
 
 _DECIMAL_COMMA = re.compile(r"\s*([-+]?\d+),(\d+)\s*")
 
@@ -105,22 +106,19 @@ def known_keys(location: list[str]) -> list[str]:
         if part in SIMULATED:
             model = SIMULATED[part]
             continue
-        annotation = model.model_fields[part].annotation
-        model = annotation if isinstance(annotation, type) else model_of(annotation)
+        model = model_of(model.model_fields[part].annotation)
     return list(model.model_fields)
 
 
 def section_name(model: type) -> tuple[str, ...]:
     """Name the section that a class describes."""
-    for name, field in Config.model_fields.items():
-        if model in (field.annotation, *get_args(field.annotation)):
-            return (name,)
-    return ()
+    fields = Config.model_fields.items()
+    return tuple(name for name, field in fields if model_of(field.annotation) is model)
 
 
 def model_of(annotation: Any) -> type[Section]:
     """Give the section of an annotation that may be None."""
-    model: type[Section] = next(a for a in get_args(annotation) if a is not type(None))
+    model: type[Section] = next(iter(get_args(annotation)), annotation)
     return model
 
 
@@ -131,40 +129,29 @@ def _is_union_branch(part: Any) -> bool:
     )
 
 
-OLD_VALUES: dict[tuple[str, str], dict[str, str]] = {
-    ("background", "method"): {"mean": "fixed", "none": "known"}
-}
-"""Section and key → old value → new value."""
+_OLD_METHODS = {"mean": "fixed", "none": "known"}
 
 
 def rename(values: dict[str, Any]) -> None:
-    """Replace old values in place, and say so in a `FutureWarning`."""
-    _name_all_frames(values)
-    for (section, key), names in OLD_VALUES.items():
-        table = values.get(section)
-        old = table.get(key) if isinstance(table, dict) else None
-        if isinstance(table, dict) and isinstance(old, str) and old in names:
-            if old == "mean" and table.get("frames") is None:
-                # Without frames the mean meant that the windows slide, where the scheme allows it.
-                del table[key]
-                _notice('background.method = "mean" without background.frames', '"sliding"')
-                continue
-            table[key] = names[old]
-            _notice(f'{section}.{key} = "{old}"', f'"{names[old]}"')
-
-
-def _name_all_frames(values: dict[str, Any]) -> None:
-    """Name the frames of a median; without frames it meant all of them in mode track."""
-    background, fit, optics = (values.get(name) for name in ("background", "fit", "optics"))
-    if not (isinstance(background, dict) and isinstance(fit, dict)):
-        return
-    dark = isinstance(optics, dict) and str(optics.get("scheme")).lower() == "darkfield"
-    median = background.get("method") == "median" and background.get("frames") is None
-    if median and fit.get("mode") == "track" and not dark:
+    """Replace old values of ``background.method`` in place, and say so in a `FutureWarning`."""
+    background, fit, optics = (
+        table if isinstance(table, dict) else {}
+        for table in (values.get(name) for name in ("background", "fit", "optics"))
+    )
+    method, unset = str(background.get("method")), background.get("frames") is None
+    dark = str(optics.get("scheme")).lower() == "darkfield"
+    if method == "median" and unset and fit.get("mode") == "track" and not dark:
         background["frames"] = ALL
         _notice(
-            'background.method = "median" without background.frames', 'background.frames = "all"'
+            'background.method = "median" without background.frames', f'background.frames = "{ALL}"'
         )
+    elif method == "mean" and unset:
+        # Without frames the mean meant that the windows slide, where the scheme allows it.
+        del background["method"]
+        _notice('background.method = "mean" without background.frames', '"sliding"')
+    elif method in _OLD_METHODS:
+        background["method"] = _OLD_METHODS[method]
+        _notice(f'background.method = "{method}"', f'"{_OLD_METHODS[method]}"')
 
 
 def _notice(old: str, new: str) -> None:
@@ -173,15 +160,6 @@ def _notice(old: str, new: str) -> None:
         FutureWarning,
         stacklevel=4,
     )
-
-
-@dataclass(frozen=True)
-class OpticsFile:
-    """Optics that ``iscat calibrate optics`` measured."""
-
-    optics: dict[str, Any]
-    uncertainty: dict[str, Any]
-    covariance: dict[str, Any]
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -199,10 +177,10 @@ def read_toml(path: Path) -> dict[str, Any]:
     return values
 
 
-def read_optics_file(path: Path) -> OpticsFile:
-    """Read the optics that were measured from a movie."""
+def read_optics_file(path: Path) -> dict[str, dict[str, Any]]:
+    """Read optics that ``iscat calibrate optics`` measured: values, errors and covariance."""
     values = read_toml(path)
-    tables = {name: values.pop(name, {}) for name in ("optics", "uncertainty", "covariance")}
+    tables = {name: values.get(name, {}) for name in ("optics", "uncertainty", "covariance")}
     checksum = values.get("template", {}).get("sha256")
     if checksum is not None:
         _check_sum(path, Path(tables["optics"].get("template", "")), checksum)
@@ -213,7 +191,7 @@ def read_optics_file(path: Path) -> OpticsFile:
         )
     if "file" in tables["optics"]:
         raise ConfigError(f"{path}: names another optics file: give that one as optics.file")
-    return OpticsFile(**tables)
+    return tables
 
 
 def _check_sum(path: Path, template: Path, checksum: str) -> None:
@@ -281,26 +259,18 @@ def config_to_toml(
     ):
         raise ConfigError(f"`sections`: has an unknown name; the sections are {', '.join(known)}")
     blocks = []
-    for name, field in type(config).model_fields.items():
-        if sections is not None and name not in sections:
-            continue
-        model: Section | type[Section]
+    for name, field in Config.model_fields.items():
         section = getattr(config, name)
-        model = section if section is not None else model_of(field.annotation)
-        if section is None and not comments:
+        if (sections is not None and name not in sections) or not (section or comments):
             continue
-        lines = [f"[{name}]" if section is not None else f"# [{name}]"]
-        tables: list[str] = []
-        fields = (model if isinstance(model, type) else type(model)).model_fields
-        for key, info in fields.items():
-            value = getattr(section, key) if section is not None else None
+        lines, tables = [f"[{name}]" if section else f"# [{name}]"], []
+        for key, info in model_of(field.annotation).model_fields.items():
+            value = getattr(section, key, None)
             if key in SIMULATED:
                 tables += [_table_toml(key, each) for each in value or ()]
-                continue
-            if value is None and not comments:
-                continue
-            line = f"# {key} =" if value is None else f"{key} = {toml_value(value)}"
-            lines.append(f"{line:<36} # {info.description}" if comments else line)
+            elif value is not None or comments:
+                line = f"# {key} =" if value is None else f"{key} = {toml_value(value)}"
+                lines.append(f"{line:<36} # {info.description}" if comments else line)
         blocks.append("\n".join([*lines, *tables]))
     return "\n\n".join(blocks) + "\n"
 
@@ -336,36 +306,40 @@ _PATH_KEYS = {
 _NOT_PATHS = ("flat", "speckle", AUTO)
 
 
+def _anchored(table: Mapping[str, Any], keys: Iterable[str], folder: Path) -> dict[str, str]:
+    """Give the paths of a table, those that are relative as of a folder."""
+    return {
+        key: str(folder / value)
+        for key in keys
+        if isinstance(value := table.get(key), str) and value not in _NOT_PATHS
+    }
+
+
 def _anchor_paths(values: dict[str, Any], folder: Path) -> None:
     """Make the relative paths of a file relative to the folder it lies in."""
     for section, keys in _PATH_KEYS.items():
         table: Any = values
         for name in section.split("."):
             table = table.get(name) if isinstance(table, dict) else None
-        if not isinstance(table, dict):
-            continue
-        for key in keys:
-            value = table.get(key)
-            if isinstance(value, str) and value not in _NOT_PATHS:
-                table[key] = str(folder / value)
+        if isinstance(table, dict):
+            table.update(_anchored(table, keys, folder))
 
 
 def with_absolute_paths(config: Config) -> Config:
     """Make the paths absolute, for a process that runs in another folder."""
-    changed: dict[str, Any] = {}
     for section, keys in _PATH_KEYS.items():
-        name, _, inner = section.partition(".")
-        whole: Any = changed.get(name, getattr(config, name))
-        table: Any = getattr(whole, inner, None) if inner else whole
-        paths = {
-            key: str(Path(value).absolute())
-            for key in keys
-            if isinstance(value := getattr(table, key, None), str) and value not in _NOT_PATHS
-        }
-        if paths:
-            table = table.model_copy(update=paths)
-            changed[name] = whole.model_copy(update={inner: table}) if inner else table
-    return config.model_copy(update=changed) if changed else config
+        config = _absolute(config, section.split("."), keys)
+    return config
+
+
+def _absolute(section: S, names: Sequence[str], keys: Iterable[str]) -> S:
+    """Make the paths absolute of a section within a section."""
+    if not names:
+        return section.model_copy(update=_anchored(vars(section), keys, Path.cwd()))
+    inner = getattr(section, names[0])
+    if inner is None:
+        return section
+    return section.model_copy(update={names[0]: _absolute(inner, names[1:], keys)})
 
 
 _EXCLUSIVE_KEYS = {
@@ -535,18 +509,13 @@ def _validated(
 def _changes(settings: Mapping[str, Any] | Iterable[str] | None) -> list[Change]:
     if settings is None:
         return []
-    if isinstance(settings, str):
-        settings = [settings]
     if not isinstance(settings, Mapping):
-        if not isinstance(settings, Iterable):
+        try:
+            texts = [settings] if isinstance(settings, str) else list(settings)
+        except TypeError:
             raise ConfigError(
                 f'`settings` = {settings!r}: give a mapping, as in {{"optics.na": 1.42}}'
-            )
-        texts: list[Any]
-        try:
-            texts = list(settings)
-        except TypeError:  # of an array without an axis
-            texts = [settings]
+            ) from None
         if not all(isinstance(text, str) for text in texts):
             raise ConfigError(
                 "`settings`: has an item that is not text; give a mapping, or texts such as "
@@ -650,7 +619,9 @@ def _merge_optics_file(values: dict[str, Any], changes: Iterable[Change]) -> Non
     if not isinstance(optics, dict) or not isinstance(path, str):
         return
     found = read_optics_file(Path(path))
-    measured = found.optics | ({"covariance": found.covariance} if found.covariance else {})
+    measured = found["optics"]
+    if found["covariance"]:
+        measured["covariance"] = found["covariance"]
     for section, key, value in changes:
         if section == "optics" and key in measured and measured[key] != value:
             raise ConfigError(

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import cmath
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from itertools import product
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, NonNegativeInt, model_validator
 
 from iscat_analysis.config.kinds import SCHEMES, SchemeKind
 from iscat_analysis.config.values import (
     LARGEST_NM,
     WAVELENGTH_NM,
     ChannelOf,
+    Diameter,
+    FillFactor,
     Finite,
+    Height,
     NonNegative,
     Positive,
+    Samples,
     Scheme,
     Section,
     length,
@@ -53,7 +58,7 @@ MOVING: Mapping[str, Any] = {
 }
 """Keys of ``[optics]`` that move the focus during a movie, and their values where it rests."""
 
-Jump = tuple[Annotated[int, Field(ge=0)], Size]
+Jump = tuple[NonNegativeInt, Size]
 """Frame, and rise of the focus there [nm]."""
 
 MOST_JUMPS = 4
@@ -86,11 +91,6 @@ class FieldTerms(Section):
         value = getattr(self, key)
         return float(value if index is None else value[index])
 
-    @property
-    def is_even(self) -> bool:
-        """Whether the microscope is the same everywhere in its field."""
-        return not any(self.field_term(name) for name in FIELD_TERMS)
-
 
 def field_keys(terms: Mapping[str, float]) -> dict[str, float | tuple[float, float]]:
     """Give coefficients as keys of ``[optics]``; what of a pair is not named is 0.
@@ -106,14 +106,9 @@ def field_keys(terms: Mapping[str, float]) -> dict[str, float | tuple[float, flo
         By key.
     """
     out: dict[str, float | tuple[float, float]] = {}
-    for name, (key, index) in FIELD_TERMS.items():
-        if name not in terms:
-            continue
-        if index is None:
-            out[key] = terms[name]
-        else:
-            pair = [terms.get(n, 0.0) for n, (k, _) in FIELD_TERMS.items() if k == key]
-            out[key] = (pair[0], pair[1])
+    for key, index in dict.fromkeys(FIELD_TERMS[name] for name in FIELD_TERMS if name in terms):
+        named = [terms.get(name, 0.0) for name, (k, _) in FIELD_TERMS.items() if k == key]
+        out[key] = named[0] if index is None else (named[0], named[1])
     return out
 
 
@@ -162,13 +157,12 @@ class OpticsCovariance(Section):
         unknown = [name for name in self.names if name not in known]
         if unknown:
             raise ValueError(f"names has {unknown[0]}, which is none of {', '.join(known)}")
-        if len(self.matrix) != size or any(len(row) != size for row in self.matrix):
+        if [len(row) for row in self.matrix] != [size] * size:
             raise ValueError(f"matrix needs {size} rows of {size} numbers, one for each of names")
-        for i, row in enumerate(self.matrix):
-            for j in range(i):
-                room = 1e-6 * math.sqrt(abs(row[i] * self.matrix[j][j]))
-                if abs(row[j] - self.matrix[j][i]) > room:
-                    raise ValueError(f"matrix is not symmetric in {self.names[i]}, {self.names[j]}")
+        for i, j in product(range(size), repeat=2):
+            row, other = self.matrix[i], self.matrix[j]
+            if abs(row[j] - other[i]) > 1e-6 * math.sqrt(abs(row[i] * other[j])):
+                raise ValueError(f"matrix is not symmetric in {self.names[i]}, {self.names[j]}")
             if row[i] < 0:
                 raise ValueError(f"matrix gives {self.names[i]} a negative variance")
         return self
@@ -181,6 +175,8 @@ LARGEST_ABERRATION = 0.5
 
 LARGEST_SD_NM = 100.0
 """Largest standard deviation of heights, half a fringe: for more, use mode joint."""
+
+Spread = Annotated[NonNegative, length(0.0, LARGEST_SD_NM)]
 
 LARGEST_ATTENUATION = 3.0
 """Largest attenuation: transmitted amplitude of the reference over that of scattered light."""
@@ -245,7 +241,7 @@ class Optics(FieldTerms):
     """the same, growing with the square of the frames from focus_frame"""
     focus_jumps: Annotated[tuple[Jump, ...], Field(max_length=MOST_JUMPS)] = ()
     """[[frame, rise], ...]: the focus rises at once, and stays"""
-    focus_frame: Annotated[int, Field(ge=0)] = 0
+    focus_frame: NonNegativeInt = 0
     """frame at which the focus is focus_nm, but for jumps"""
     convention: Literal["exact", "dong2021"] = "exact"
     """ "exact" | "dong2021" (the paper's numbers, errors included)"""
@@ -321,49 +317,51 @@ class Optics(FieldTerms):
 
     @model_validator(mode="after")
     def _possible(self) -> Optics:
+        for refusal in self._refusals():
+            raise ValueError(refusal)
+        return self
+
+    def _refusals(self) -> Iterator[str]:
         if self.mask_na >= self.na:
-            raise ValueError(
+            yield (
                 f"mask_na = {self.mask_na} must be below na = {self.na}: a mask that covers the "
                 "whole pupil is attenuation without mask_na"
             )
         for name, size in self.aberrations_nm.items():
             if abs(size) > LARGEST_ABERRATION * self.wavelength_nm:
-                raise ValueError(
+                yield (
                     f"aberrations_nm.{name} = {size:g} exceeds {LARGEST_ABERRATION:g} wavelengths "
                     "rms: give nanometres of path, rms over the pupil"
                 )
         if self.na >= self.n_immersion:
-            raise ValueError(
+            yield (
                 f"na = {self.na} must be below n_immersion = {self.n_immersion}: "
                 "lower na, or give the index of the oil that was used"
             )
         if self.na >= self.n_glass:
-            raise ValueError(
+            yield (
                 f"na = {self.na} must be below n_glass = {self.n_glass}: such light cannot "
                 "cross the coverslip"
             )
         if self.psf == "measured" and self.template is None:
-            raise ValueError(
+            yield (
                 'psf = "measured" needs a template: run `iscat calibrate optics MOVIE --measured` '
                 "and give its optics.toml as optics.file"
             )
         if self.psf == "measured" and not self.interferes:
-            raise ValueError(
+            yield (
                 'psf = "measured" needs an interferometric scheme: in dark field the image is the '
                 "square of the field, which the template does not have"
             )
         if self.kind.reflected and self.n_glass == self.n_sample:
-            raise ValueError(
-                "n_glass equals n_sample: nothing is reflected, so there is no iSCAT reference"
-            )
+            yield "n_glass equals n_sample: nothing is reflected, so there is no iSCAT reference"
         if self.attenuation > LARGEST_ATTENUATION:
-            raise ValueError(
+            yield (
                 f"attenuation = {self.attenuation:g} is more than {LARGEST_ATTENUATION:g}: it is "
                 "the part of the reference's amplitude that passes, as 0.1 for a tenth"
             )
         if self.interferes and self.attenuation == 0:
-            raise ValueError('attenuation = 0 leaves no reference: use scheme = "darkfield"')
-        return self
+            yield 'attenuation = 0 leaves no reference: use scheme = "darkfield"'
 
 
 AUTO = "auto"
@@ -397,10 +395,10 @@ class CameraConfig(Section):
     """absent: taken from the metadata"""
     frame_rate_hz: Positive | None = None
     """absent: taken from the metadata"""
-    samples_per_pixel: Literal["auto"] | Annotated[int, Field(ge=1, le=9)] = "auto"
+    samples_per_pixel: Samples = "auto"
     """along each axis, to integrate over pixels: 1 to 9 | "auto": as many as are needed, or
     those of the calibration's standards; 1: the light at the centre"""
-    fill_factor: Annotated[float, Field(gt=0, le=1)] = 1.0
+    fill_factor: FillFactor = 1.0
     """share of a pixel's area that detects light, a square at its centre"""
 
     @property
@@ -408,6 +406,13 @@ class CameraConfig(Section):
         """The camera without a movie: "auto" is replaced by an assumed number."""
         numbers = {key: value for key, value in ASSUMED.items() if getattr(self, key) == AUTO}
         return self.model_copy(update=numbers) if numbers else self
+
+
+_OF_MODELS = {
+    "shell": ("shell_nm", "shell_index", "density_kg_m3"),
+    "rod": ("aspect_ratio", "azimuth_deg", "tilt_deg"),
+}
+"""Model → what it needs, and others do not have; all have a density."""
 
 
 class Particle(Section):
@@ -436,21 +441,19 @@ class Particle(Section):
     """replaces that of the kind; for model shell, of core and shell together"""
     mass_kda: Positive | None = None
     """start value, and the true mass in a simulation"""
-    diameter_nm: Annotated[Positive, length(0.1, 1e4)] | None = None
+    diameter_nm: Diameter | None = None
     """in place of mass_kda"""
-    height_nm: Literal["contact", "auto"] | Annotated[NonNegative, length(0.0, LARGEST_NM)] = (
-        USUAL_HEIGHT_NM
-    )
+    height_nm: Literal["contact", "auto"] | Height = USUAL_HEIGHT_NM
     """z if it is fixed, else its start value | "contact": radius of the particle + linker_nm; a
     sphere that has the default does that too | "auto": 5 nm for optics and mass scale; for the
     particles, mean and spread are learned from the movie"""
-    linker_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] = 0.0
+    linker_nm: Height = 0.0
     """between coverslip and particle, for height_nm = "contact" """
-    height_sd_nm: Annotated[NonNegative, length(0.0, LARGEST_SD_NM)] = 0.0
+    height_sd_nm: Spread = 0.0
     """standard deviation of heights; > 0: mode mass fits z with this normal prior"""
-    wiggle_nm: Annotated[NonNegative, length(0.0, LARGEST_SD_NM)] = 0.0
+    wiggle_nm: Spread = 0.0
     """standard deviation of a particle's position along each axis, if it wiggles as on a tether"""
-    learned_height_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = None
+    learned_height_nm: Height | None = None
     """mean height that height_nm = "auto" learned from a movie; optics and mass scale stay those of
     height_nm"""
     photons_per_frame: Positive | None = None
@@ -458,44 +461,43 @@ class Particle(Section):
     mass scale"""
 
     @model_validator(mode="after")
-    def _one_of(self) -> Particle:
+    def _possible(self) -> Particle:
+        for refusal in self._refusals():
+            raise ValueError(refusal)
+        return self
+
+    def _refusals(self) -> Iterator[str]:
         if self.permittivity is not None and self.index is not None:
-            raise ValueError("give permittivity or index, not both")
+            yield "give permittivity or index, not both"
         if self.mass_kda is not None and self.diameter_nm is not None:
-            raise ValueError("give mass_kda or diameter_nm, not both")
-        if self.kind == "custom":
-            if self.permittivity is None and self.index is None:
-                raise ValueError('kind = "custom" needs permittivity or index')
-            if self.density_kg_m3 is None:
-                raise ValueError('kind = "custom" needs density_kg_m3')
-        for name in ("shell_nm", "shell_index", "density_kg_m3"):
-            value = getattr(self, name)
-            if self.model == "shell" and value is None:
-                raise ValueError(f'model = "shell" needs {name}')
-            if self.model != "shell" and name != "density_kg_m3" and value is not None:
-                raise ValueError(f'{name} = {value:g} needs model = "shell"')
-        for name in ("aspect_ratio", "azimuth_deg", "tilt_deg"):
-            value = getattr(self, name)
-            if self.model == "rod" and value is None:
-                raise ValueError(f'model = "rod" needs {name}')
-            if self.model != "rod" and value is not None:
-                raise ValueError(f'{name} = {value:g} needs model = "rod"')
+            yield "give mass_kda or diameter_nm, not both"
+        custom = self.kind == "custom"
+        if custom and self.given_index is None:
+            yield 'kind = "custom" needs permittivity or index'
+        if custom and self.density_kg_m3 is None:
+            yield 'kind = "custom" needs density_kg_m3'
+        for model, names in _OF_MODELS.items():
+            for name in names:
+                value = getattr(self, name)
+                if self.model == model and value is None:
+                    yield f'model = "{model}" needs {name}'
+                if self.model != model and value is not None and name != "density_kg_m3":
+                    yield f'{name} = {value:g} needs model = "{model}"'
         if self.shell_nm is not None and self.shell_nm > self.nominal_diameter_nm / 2:
-            raise ValueError(
+            yield (
                 f"shell_nm = {self.shell_nm:g} is more than the radius of a particle of "
                 f"{self.nominal_diameter_nm:g} nm: the shell is a part of the diameter"
             )
         if self.linker_nm and self.height_nm != "contact":
-            raise ValueError(
+            yield (
                 f'linker_nm = {self.linker_nm:g} needs height_nm = "contact", and height_nm is '
                 f'{self.height_nm}: set height_nm = "contact", or leave linker_nm out'
             )
         if self.learned_height_nm is not None and self.height_nm != "auto":
-            raise ValueError(
+            yield (
                 f'learned_height_nm = {self.learned_height_nm:g} is what height_nm = "auto" found: '
                 "set height_nm to it, or leave it out"
             )
-        return self
 
     @property
     def density(self) -> float:
@@ -582,13 +584,8 @@ class Particle(Section):
         Particle
             Without a prior of heights.
         """
-        update = {
-            "height_nm": height_nm,
-            "linker_nm": 0.0,
-            "height_sd_nm": 0.0,
-            "learned_height_nm": None,
-        }
-        return self.model_copy(update=update)
+        known = {"height_nm": height_nm, "learned_height_nm": None}
+        return self.model_copy(update={**known, "linker_nm": 0.0, "height_sd_nm": 0.0})
 
     @property
     def height_is_open(self) -> bool:

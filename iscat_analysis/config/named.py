@@ -51,25 +51,27 @@ class Instruments(dict[str, Instrument]):
         return "\n".join([*lines, 'as in configure(instrument="iscat")'])
 
 
-_LIGHT = {"simulation.background": "speckle", "simulation.power_noise": 0.01}
-"""Glass is rough and lasers flicker, which tells the camera's gain and offset."""
+def _settings(photons: float, pixel_nm: float, optics: Mapping[str, Any]) -> dict[str, Any]:
+    """Give the keys of a set-up; glass is rough and lasers flicker, which tells the camera."""
+    return {
+        **{f"optics.{key}": value for key, value in optics.items()},
+        "camera.pixel_size_nm": pixel_nm,
+        "bounds.photons_per_pixel": photons,
+        "simulation.photons_per_pixel": photons,
+        "simulation.background": "speckle",
+        "simulation.power_noise": 0.01,
+    }
+
+
+_MASKED = {"na": 1.42, "mask_na": 0.6, "focus_nm": -200.0}
+_TRANSMITTED = {"scheme": "cobri", "n_immersion": 1.5, "n_glass": 1.5, "attenuation": 0.0601}
 
 # In mode mass, the focus is where dark particles have the largest contrast.
 instruments = Instruments(
     {
         "mass-photometer-445": Instrument(
             "home-built mass photometer, 445 nm, a mask that lets 1 % of the reflected light pass",
-            {
-                "optics.wavelength_nm": 445.0,
-                "optics.na": 1.42,
-                "optics.attenuation": 0.1,
-                "optics.mask_na": 0.6,
-                "optics.focus_nm": -200.0,
-                "camera.pixel_size_nm": 84.4,
-                "bounds.photons_per_pixel": 1e6,
-                "simulation.photons_per_pixel": 1e6,
-                **_LIGHT,
-            },
+            _settings(1e6, 84.4, {**_MASKED, "wavelength_nm": 445.0, "attenuation": 0.1}),
             "Cole, ACS Photonics 4, 211 (2017); Young, Science 360, 423 (2018)",
             110.0,
         ),
@@ -77,49 +79,21 @@ instruments = Instruments(
         # 6.1e-5 in a published table of events.
         "mass-photometer-525": Instrument(
             "commercial mass photometer, 525 nm, pixels of 19.3 nm binned 4 x 4",
-            {
-                "optics.wavelength_nm": 525.0,
-                "optics.na": 1.42,
-                "optics.attenuation": 0.03,
-                "optics.mask_na": 0.6,
-                "optics.focus_nm": -200.0,
-                "camera.pixel_size_nm": 77.2,
-                "bounds.photons_per_pixel": 1e5,
-                "simulation.photons_per_pixel": 1e5,
-                **_LIGHT,
-            },
+            _settings(1e5, 77.2, {**_MASKED, "wavelength_nm": 525.0, "attenuation": 0.03}),
             "Refeyn OneMP, as in Sonn-Segev, Nat. Commun. 11, 1772 (2020)",
             97.0,
         ),
         "iscat": Instrument(
             "plain iSCAT, 405 nm, all reflected light on a camera with a deep well",
-            {
-                "optics.wavelength_nm": 405.0,
-                "optics.na": 1.4,
-                "optics.focus_nm": -150.0,
-                "camera.pixel_size_nm": 60.0,
-                "bounds.photons_per_pixel": 1e6,
-                "simulation.photons_per_pixel": 1e6,
-                **_LIGHT,
-            },
+            _settings(1e6, 60.0, {"wavelength_nm": 405.0, "na": 1.4, "focus_nm": -150.0}),
             "Piliarik and Sandoghdar, Nat. Commun. 5, 4495 (2014)",
             19.0,
         ),
         "cobri": Instrument(
             "COBRI, 517.5 nm: transmitted light attenuated to 0.4 %",
-            {
-                "optics.scheme": "cobri",
-                "optics.wavelength_nm": 517.5,
-                "optics.na": 1.3,
-                "optics.n_immersion": 1.5,
-                "optics.n_glass": 1.5,
-                "optics.attenuation": 0.0601,
-                "optics.focus_nm": -250.0,
-                "camera.pixel_size_nm": 80.0,
-                "bounds.photons_per_pixel": 1e6,
-                "simulation.photons_per_pixel": 1e6,
-                **_LIGHT,
-            },
+            _settings(
+                1e6, 80.0, {**_TRANSMITTED, "wavelength_nm": 517.5, "na": 1.3, "focus_nm": -250.0}
+            ),
             "Huang, ACS Nano 11, 2575 (2017); Dong, J. Phys. D 54, 394002 (2021)",
             9.1,
         ),

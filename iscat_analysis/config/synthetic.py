@@ -4,19 +4,35 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 
-from iscat_analysis.config.values import LARGEST_NM, Finite, NonNegative, Positive, Section, length
+from iscat_analysis.config.values import (
+    LARGEST_NM,
+    Diameter,
+    Finite,
+    Height,
+    NonNegative,
+    Positive,
+    Section,
+    length,
+)
 
 _MOST_POSITIONS = 100_000_000
+Side = Annotated[int, Field(ge=8, le=16_384)]
+Probability = Annotated[float, Field(gt=0, lt=0.5)]
+
+
+def _refuse_early(frame: int, leave: int | None) -> None:
+    if leave is not None and leave <= frame:
+        raise ValueError(f"leave = {leave} must come after frame = {frame}")
 
 
 class SimulatedEvent(Section):
     """One particle that lands, and may leave."""
 
-    frame: Annotated[int, Field(ge=0)]
+    frame: NonNegativeInt
     """first frame with the particle"""
-    leave: Annotated[int, Field(ge=1)] | None = None
+    leave: PositiveInt | None = None
     """first frame without it again"""
     x_px: Finite
     """column; integer = pixel centre; with drift, that of its first frame"""
@@ -29,8 +45,7 @@ class SimulatedEvent(Section):
 
     @model_validator(mode="after")
     def _leaves_later(self) -> SimulatedEvent:
-        if self.leave is not None and self.leave <= self.frame:
-            raise ValueError(f"leave = {self.leave} must come after frame = {self.frame}")
+        _refuse_early(self.frame, self.leave)
         return self
 
 
@@ -43,11 +58,11 @@ class SimulatedMover(Section):
     """diffusion coefficient along each axis, µm²/s"""
     mass_kda: Positive | None = None
     """default particle.mass_kda"""
-    diameter_nm: Annotated[Positive, length(0.1, 1e4)] | None = None
+    diameter_nm: Diameter | None = None
     """in place of mass_kda, of the material of [particle]"""
     space: Literal["membrane", "volume"] = "membrane"
     """ "membrane": z is fixed | "volume": above a wall at z = 0"""
-    z_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = None
+    z_nm: Height | None = None
     """at first; default particle.height_nm, with a ceiling random below it"""
     ceiling_nm: Annotated[Positive, length(0.0, LARGEST_NM)] | None = None
     """volume: height of a second wall that reflects"""
@@ -55,9 +70,9 @@ class SimulatedMover(Section):
     """velocity along x and y, µm/s"""
     confinement_nm: Annotated[Positive, length(1.0, LARGEST_NM)] | None = None
     """side of a square whose walls reflect, one for each particle"""
-    frame: Annotated[int, Field(ge=0)] = 0
+    frame: NonNegativeInt = 0
     """first frame with the particles"""
-    leave: Annotated[int, Field(ge=1)] | None = None
+    leave: PositiveInt | None = None
     """first frame without them again"""
     x_px: Finite | None = None
     """column at first, of a single particle; absent: random"""
@@ -68,8 +83,7 @@ class SimulatedMover(Section):
     def _possible(self) -> SimulatedMover:
         if self.mass_kda is not None and self.diameter_nm is not None:
             raise ValueError("give mass_kda or diameter_nm, not both")
-        if self.leave is not None and self.leave <= self.frame:
-            raise ValueError(f"leave = {self.leave} must come after frame = {self.frame}")
+        _refuse_early(self.frame, self.leave)
         if (self.x_px is None) != (self.y_px is None):
             raise ValueError("give x_px and y_px, or neither")
         if self.x_px is not None and self.count != 1:
@@ -77,13 +91,10 @@ class SimulatedMover(Section):
                 f"count = {self.count} particles cannot all begin at x_px, y_px: leave the "
                 "position out, or give each particle its own block"
             )
-        if self.ceiling_nm is not None:
-            if self.space == "membrane":
-                raise ValueError('ceiling_nm needs space = "volume"')
-            if self.z_nm is not None and self.z_nm > self.ceiling_nm:
-                raise ValueError(
-                    f"z_nm = {self.z_nm:g} lies above ceiling_nm = {self.ceiling_nm:g}"
-                )
+        if self.ceiling_nm is not None and self.space == "membrane":
+            raise ValueError('ceiling_nm needs space = "volume"')
+        if self.ceiling_nm is not None and (self.z_nm or 0.0) > self.ceiling_nm:
+            raise ValueError(f"z_nm = {self.z_nm:g} lies above ceiling_nm = {self.ceiling_nm:g}")
         return self
 
 
@@ -94,10 +105,7 @@ SIMULATED: dict[str, type[Section]] = {"events": SimulatedEvent, "movers": Simul
 class Simulation(Section):
     """A synthetic movie with known truth."""
 
-    shape: tuple[Annotated[int, Field(ge=8, le=16_384)], Annotated[int, Field(ge=8, le=16_384)]] = (
-        128,
-        128,
-    )
+    shape: tuple[Side, Side] = (128, 128)
     """rows, columns"""
     # Longest simulated movie; particles that move have positions in all of its frames
     frames: Annotated[int, Field(ge=2, le=10_000_000)] = 400
@@ -113,7 +121,7 @@ class Simulation(Section):
     """relative laser-power noise, frame to frame"""
     drift_px_per_frame: tuple[Finite, Finite] = (0.0, 0.0)
     """of background and particles together, along x and y"""
-    seed: Annotated[int, Field(ge=0)] = 1
+    seed: NonNegativeInt = 1
     """same seed, same bytes"""
     events: tuple[SimulatedEvent, ...] = ()
     """each particle, placed by hand"""
@@ -121,7 +129,7 @@ class Simulation(Section):
     """particles that diffuse, by kind"""
     count: Annotated[int, Field(ge=0, le=1_000_000)] | None = None
     """landings at random positions and times, instead of events; 0: a blank"""
-    leavings: Annotated[int, Field(ge=0)] = 0
+    leavings: NonNegativeInt = 0
     """how many of the count leave before the movie ends"""
     species: tuple[Positive, ...] | None = None
     """masses [kDa] of the random particles, in equal shares"""
@@ -138,32 +146,22 @@ class Simulation(Section):
                 f"{moving} movers in frames = {self.frames} have {moving * self.frames} positions, "
                 f"more than {_MOST_POSITIONS}: simulate fewer, or a shorter movie"
             )
-        for number, event in enumerate(self.events):
-            inside = (
-                -0.5 <= event.y_px < self.shape[0] - 0.5
-                and -0.5 <= event.x_px < self.shape[1] - 0.5
-            )
-            if not inside:
+        rows, columns = self.shape
+        particles: list[tuple[str, SimulatedEvent | SimulatedMover]] = [
+            *((f"events[{k}]", one) for k, one in enumerate(self.events)),
+            *((f"movers[{k}]", one) for k, one in enumerate(self.movers)),
+        ]
+        for name, one in particles:
+            x, y = one.x_px or 0.0, one.y_px or 0.0
+            if not (-0.5 <= y < rows - 0.5 and -0.5 <= x < columns - 0.5):
                 raise ValueError(
-                    f"events[{number}] at x_px = {event.x_px}, y_px = {event.y_px} lies outside "
-                    f"the field of {self.shape[1]} x {self.shape[0]} pixels"
+                    f"{name} at x_px = {x}, y_px = {y} lies outside the field of {columns} x "
+                    f"{rows} pixels"
                 )
-            if event.frame >= self.frames:
+            if one.frame >= self.frames:
                 raise ValueError(
-                    f"events[{number}] appears at frame {event.frame}, after the "
-                    f"{self.frames} frames of the movie"
-                )
-        for number, mover in enumerate(self.movers):
-            if mover.frame >= self.frames:
-                raise ValueError(
-                    f"movers[{number}] appear at frame {mover.frame}, after the {self.frames} "
-                    "frames of the movie"
-                )
-            x, y = mover.x_px or 0.0, mover.y_px or 0.0
-            if not (-0.5 <= y < self.shape[0] - 0.5 and -0.5 <= x < self.shape[1] - 0.5):
-                raise ValueError(
-                    f"movers[{number}] at x_px = {x}, y_px = {y} begins outside the field of "
-                    f"{self.shape[1]} x {self.shape[0]} pixels"
+                    f"{name} appears at frame {one.frame}, after the {self.frames} frames of the "
+                    "movie"
                 )
         return self
 
@@ -181,11 +179,11 @@ class BoundsConfig(Section):
     """default particle.height_nm"""
     photons_per_pixel: Positive = 1e4
     """background per frame; dark field: as in [simulation]"""
-    n_before: Annotated[int, Field(ge=0)] = 200
+    n_before: NonNegativeInt = 200
     """0: known background"""
-    n_after: Annotated[int, Field(ge=1)] = 200
+    n_after: PositiveInt = 200
     """frames with the particle"""
-    false_alarm_probability: Annotated[float, Field(gt=0, lt=0.5)] = 1e-3
+    false_alarm_probability: Probability = 1e-3
     """for the smallest detected mass: that noise is taken for a particle"""
-    miss_probability: Annotated[float, Field(gt=0, lt=0.5)] = 0.05
+    miss_probability: Probability = 0.05
     """for the smallest detected mass: that the particle is not found"""

@@ -141,6 +141,11 @@ FramesOrAll = Annotated[
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+Height = Annotated[NonNegative, length(0.0, LARGEST_NM)]
+Diameter = Annotated[Positive, length(0.1, 1e4)]
+Samples = Literal["auto"] | Annotated[int, Field(ge=1, le=9)]
+""" "auto" or how many along each axis of a pixel"""
+FillFactor = Annotated[float, Field(gt=0, le=1)]
 
 
 class _Called(ModelMetaclass):

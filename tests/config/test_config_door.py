@@ -293,8 +293,8 @@ def test_an_optics_file_wins_over_the_section(setup: Path) -> None:
     assert config.optics.attenuation == 0.5
     assert config.optics.file is not None
     measured = read_optics_file(Path(config.optics.file))
-    assert measured.uncertainty == {"na": 0.0004, "focus_nm": 2.2}
-    assert measured.covariance["matrix"][1][1] == 4.84
+    assert measured["uncertainty"] == {"na": 0.0004, "focus_nm": 2.2}
+    assert measured["covariance"]["matrix"][1][1] == 4.84
 
 
 def test_an_optics_file_survives_the_way_through_a_resolved_file(setup: Path) -> None:

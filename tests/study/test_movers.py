@@ -423,8 +423,8 @@ def test_the_configuration_is_written_and_read_again() -> None:
         ({"d_um2_s": 1, "mass_kda": 9, "diameter_nm": 9}, "give mass_kda or diameter_nm, not both"),
         ({"d_um2_s": 1, "x_px": 9}, "give x_px and y_px, or neither"),
         ({"d_um2_s": 1, "x_px": 9, "y_px": 9, "count": 2}, "count = 2 particles cannot all begin"),
-        ({"d_um2_s": 1, "x_px": 9, "y_px": 99}, "begins outside the field of 44 x 40 pixels"),
-        ({"d_um2_s": 1, "frame": 12}, "movers[0] appear at frame 12, after the 12 frames"),
+        ({"d_um2_s": 1, "x_px": 9, "y_px": 99}, "lies outside the field of 44 x 40 pixels"),
+        ({"d_um2_s": 1, "frame": 12}, "movers[0] appears at frame 12, after the 12 frames"),
         ({"d_um2_s": 1, "frame": 5, "leave": 5}, "leave = 5 must come after frame = 5"),
         ({"d_um2_s": 1, "ceiling_nm": 300}, 'ceiling_nm needs space = "volume"'),
         (
