@@ -46,7 +46,7 @@ def iscat(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> pd.Da
     )  # fmt: skip
     counts = gather(
         config, before, after, n_before=setup.n_before, n_after=setup.n_after,
-        power_ratio=setup.n_after / max(setup.n_before, 1), level=setup.level_fitted, masked=None,
+        power_ratio=setup.n_after / max(setup.n_before, 1), level=setup.level_fitted,
     )  # fmt: skip
     compile_kernels(counts.model, parts_of(setup.free, posteriors=False))
     pixel = setup.pixel_size_nm

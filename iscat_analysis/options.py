@@ -37,6 +37,11 @@ class Option:
     default: Any = None
 
     @property
+    def named(self) -> Any:
+        """The type as it is written where it is named only."""
+        return getattr(self.kind, "__forward_arg__", self.kind)
+
+    @property
     def flag(self) -> str:
         """What begins the option on the command line; empty where it has none."""
         return self.written.partition(" ")[0]
@@ -214,7 +219,7 @@ def takes(keywords: type) -> Callable[[F], F]:
         *own, _ = declared.parameters.values()
         kind = inspect.Parameter.KEYWORD_ONLY
         added = [
-            inspect.Parameter(name, kind, default=option.default, annotation=option.kind)
+            inspect.Parameter(name, kind, default=option.default, annotation=option.named)
             for name, option in known.items()
         ]
         signature = declared.replace(parameters=[*own, *added])

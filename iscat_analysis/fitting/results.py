@@ -122,9 +122,14 @@ def evidence_beside(
 def _line(
     context: AnalysisContext, event: Event, quantum: Mapping[float, ComplexArray]
 ) -> dict[str, Any]:
-    line = line_of(
-        event.likelihood, event.fit, collected_photons(context, event), flags=event.flags,
-        frame=event.frame, n_before=event.n_before, n_after=event.n_after, sign=event.sign,
+    line: dict[str, Any] = {
+        "frame": event.frame,
+        "n_before": event.n_before,
+        "n_after": event.n_after,
+    }
+    line |= line_of(
+        event.likelihood, event.fit, collected_photons(context, event), event.flags,
+        sign=event.sign,
         quantum=None if event.sphere else quantum.get(event.fit.estimate[2]),
     )  # fmt: skip
     if context.spheres_of(context.model) and event.sphere is None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,22 +38,13 @@ from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.optics.model import collected_area_nm2, photons_per_intensity
+from iscat_analysis.options import takes
+from iscat_analysis.pieces.groups import ImageOptions
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray
 from iscat_analysis.units import count
 
-T = TypeVar("T")
-
 LARGEST_REGION = 1500
 """Pixels along a side of a region, whose bounds take half a gigabyte."""
-
-
-def _given(name: str, value: T | None, kind: type[T], example: str) -> T:
-    """Refuse an argument of another type."""
-    if not isinstance(value, kind):
-        raise ConfigError(
-            f"{name}: is {type(value).__name__}; give what iscat_analysis.{example} returns"
-        )
-    return value
 
 
 def config_of(
@@ -62,29 +53,30 @@ def config_of(
     camera: CameraConfig | None,
     *,
     mode: str = "joint",
-    z_range_nm: tuple[float, float] | None = None,
+    z_range_nm: tuple[float, float] = (0.0, 1000.0),
     calibration: Calibration | None = None,
 ) -> Config:
     """Put microscope, particle and camera together."""
-    optics = _given("optics", optics, Optics, "Optics(na=1.42)")
-    particle = _given("particle", particle, Particle, "Particle(mass_kda=480)")
-    camera = _given("camera", camera, CameraConfig, "Camera(pixel_size_nm=84.4)")
-    if calibration is not None and not isinstance(calibration, Calibration):
-        raise ConfigError(
-            f"calibration: is {type(calibration).__name__}; give what "
-            "iscat_analysis.Calibration(gradient_per_kda=-3.1e-5) returns, or None"
-        )
-    if camera.pixel_size_nm is None:
+    line = "Calibration(gradient_per_kda=-3.1e-5)"
+    for name, value, kinds, example in (
+        ("optics", optics, Optics, "Optics(na=1.42) returns"),
+        ("particle", particle, Particle, "Particle(mass_kda=480) returns"),
+        ("camera", camera, CameraConfig, "Camera(pixel_size_nm=84.4) returns"),
+        ("calibration", calibration, Calibration | None, f"{line} returns, or None"),
+    ):
+        if not isinstance(value, kinds):
+            raise ConfigError(
+                f"{name}: is {type(value).__name__}; give what iscat_analysis.{example}"
+            )
+    if camera is None or camera.pixel_size_nm is None:
         raise ConfigError("camera.pixel_size_nm is needed: Camera(pixel_size_nm=84.4)")
     if isinstance(camera.assumed.read_noise_e, str):
         raise ConfigError(
             f"camera.read_noise_e = {camera.read_noise_e!r} is a map: give one number [e]"
         )
     choice_in("mode", mode, tuple(FREE_PARAMETERS))
-    fit = {"mode": mode} if z_range_nm is None else {"mode": mode, "z_range_nm": z_range_nm}
-    return Config(
-        optics=optics, particle=particle, camera=camera, calibration=calibration, fit=Fit(**fit)
-    )
+    fit = Fit(mode=mode, z_range_nm=z_range_nm)
+    return Config(optics=optics, particle=particle, camera=camera, calibration=calibration, fit=fit)
 
 
 def together(
@@ -155,23 +147,21 @@ class Counts:
     def likelihood(self, index: int) -> Likelihood:
         """Likelihood of one region."""
         if self.sigma is not None:
-            return gaussian(
-                self.model, self.grid, self.after[index], self.sigma[index],
-                masked=self.masked[index],
-            )  # fmt: skip
-        read = float(self.config.camera.assumed.read_noise_e) ** 2
-        ratio = float(self.ratio[index])
+            contrast, sigma, masked = (a[index] for a in (self.after, self.sigma, self.masked))
+            return gaussian(self.model, self.grid, contrast, sigma, masked=masked)
+        ratio, read_e = float(self.ratio[index]), float(self.config.camera.assumed.read_noise_e)
+        interferes, counted = bool(self.model.rho), self.n_before > 0
         return counts_likelihood(
             self.model,
             self.grid,
             self.before[index],
             self.after[index],
             ratio,
-            background=MEAN if self.n_before else KNOWN,
-            noise=choose_noise("auto", interferes=bool(self.model.rho), counted=self.n_before > 0),
-            scale_e=None if self.model.rho else self._scale_e(ratio),
-            read_variance_before_e2=self.n_before * read,
-            read_variance_after_e2=self.n_after * read,
+            background=MEAN if counted else KNOWN,
+            noise=choose_noise("auto", interferes=interferes, counted=counted),
+            scale_e=None if interferes else self._scale_e(ratio),
+            read_variance_before_e2=self.n_before * read_e**2,
+            read_variance_after_e2=self.n_after * read_e**2,
             masked=self.masked[index],
         )
 
@@ -193,19 +183,12 @@ class Counts:
         return per_frame * ratio * max(self.n_before, 1)
 
 
+@takes(ImageOptions)
 def gather(
     config: Config,
     before: ArrayLike | None,
     after: ArrayLike | None,
-    *,
-    contrast: ArrayLike | None = None,
-    sigma: ArrayLike | None = None,
-    n_before: int | None,
-    n_after: int | None,
-    power_ratio: ArrayLike | None,
-    level: bool | None,
-    masked: ArrayLike | None,
-    saturated: ArrayLike | None = None,
+    **options: Unpack[ImageOptions],
 ) -> Counts:
     """Check the counts, or contrasts, and the arguments that describe them.
 
@@ -213,56 +196,35 @@ def gather(
 
     Shapes: `before, after, contrast` (n, y, x).
     """
-    _require(
-        before=before, after=after, contrast=contrast, sigma=sigma, n_before=n_before,
-        n_after=n_after, power_ratio=power_ratio,
-    )  # fmt: skip
+    contrast, sigma, power_ratio = (options[k] for k in ("contrast", "sigma", "power_ratio"))
+    _require({"before": before, "after": after, **options})
     name, given = ("after", after) if contrast is None else ("contrast", contrast)
     events = real_array(name, () if given is None else given)
     if events.ndim != 3 or min(events.shape[1:], default=0) < 5:
         raise DataError(
             f"{name}: has shape {events.shape}; give regions of at least 5 x 5 pixels as (n, y, x)"
         )
-    spread: FloatArray | None = None
+    n_before, n_after, spread = options["n_before"], options["n_after"], None
     if sigma is not None:
         spread = _sigma_of(sigma, events.shape)
         before, n_before, n_after = 1.0, 0, 1
-    frames_before = int(number_in("n_before", n_before, least=0, whole=True))
-    frames_after = int(number_in("n_after", n_after, least=1, whole=True))
-    background = real_array("before", () if before is None else before)
-    if background.shape != events.shape:
-        known = not frames_before and background.shape in ((), events.shape[1:])
-        if not known:
-            also = "" if frames_before else ", an image (y, x) or a number"
-            raise DataError(
-                f"before: has shape {background.shape}; give {events.shape} as after has{also}"
-            )
-        background = np.array(np.broadcast_to(background, events.shape))
-    burnt = _mask_of("saturated", saturated, events.shape)
-    out = _mask_of("masked", masked, events.shape) | burnt
+    n_before = int(number_in("n_before", n_before, least=0, whole=True))
+    n_after = int(number_in("n_after", n_after, least=1, whole=True))
+    background = _background_of(before, events.shape, known=not n_before)
+    burnt = _mask_of("saturated", options["saturated"], events.shape)
+    out = _mask_of("masked", options["masked"], events.shape) | burnt
     for label, array in (("before", background), (name, events)):
         wrong = int(np.count_nonzero(~np.isfinite(array) & ~out))
         if wrong:
             raise DataError(
                 f"{label}: is not finite in {count(wrong, 'pixel')}; mask them with masked=…"
             )
-    frames = frames_after / max(frames_before, 1)
-    ratio = real_array("power_ratio", frames if power_ratio is None else power_ratio)
-    if ratio.shape not in ((), events.shape[:1]):
-        raise DataError(
-            f"power_ratio: has shape {ratio.shape}; give one number or {events.shape[0]}"
-        )
-    bad = ~((ratio > 1 / LARGEST_RATIO) & (ratio < LARGEST_RATIO))
-    if bad.any():
-        raise DataError(
-            f"power_ratio = {ratio[bad].flat[0]:g}: give the light after over that before, above 0 "
-            f"and below {LARGEST_RATIO:g}"
-        )
+    usual = n_after / max(n_before, 1)
+    ratio = _ratio_of(usual if power_ratio is None else power_ratio, len(events))
     pixel_nm = float(config.camera.pixel_size_nm or 0.0)
     rows, columns = events.shape[1:]
     reach = math.hypot(rows + 2, columns + 2) * pixel_nm + window_nm(pixel_nm)
     model = forward_model(config, reach)
-    guessed = (frames_before > 0 or sigma is not None) and power_ratio is None and bool(model.rho)
     if model.rho:
         _refuse_other_numbers(name, events, out)
     elif contrast is not None:
@@ -271,30 +233,47 @@ def gather(
             "give photoelectrons as before=… and after=…"
         )
     if contrast is not None and sigma is None:
-        events = ratio.reshape(-1, 1, 1) * background * (1 + events)
+        events = ratio[:, None, None] * background * (1 + events)
+    level = (n_before > 0 or sigma is not None) and power_ratio is None and bool(model.rho)
+    if options["level"] is not None:
+        level = truth_in("level", options["level"])
+    grid = PixelGrid.region((0, rows), (0, columns), pixel_nm)
     return Counts(
-        config=config,
-        model=model,
-        grid=PixelGrid.region((0, rows), (0, columns), pixel_nm),
-        before=background,
-        after=events,
-        ratio=np.array(np.broadcast_to(ratio, events.shape[:1])),
-        level=guessed if level is None else truth_in("level", level),
-        n_before=frames_before,
-        n_after=frames_after,
-        masked=out,
-        saturated=burnt,
-        sigma=spread,
+        config, model, grid, background, events, ratio, level, n_before, n_after, out, burnt, spread
     )
 
 
-def _require(**given: ArrayLike | None) -> None:
+def _background_of(before: ArrayLike | None, shape: tuple[int, ...], *, known: bool) -> FloatArray:
+    """Give the light before every region; one that is known may be an image or a number."""
+    background = real_array("before", () if before is None else before)
+    if background.shape not in ((shape, shape[1:], ()) if known else (shape,)):
+        also = ", an image (y, x) or a number" if known else ""
+        raise DataError(f"before: has shape {background.shape}; give {shape} as after has{also}")
+    return np.array(np.broadcast_to(background, shape))
+
+
+def _ratio_of(power_ratio: ArrayLike, regions: int) -> FloatArray:
+    """Give the light after over that before of every region."""
+    ratio = real_array("power_ratio", power_ratio)
+    if ratio.shape not in ((), (regions,)):
+        raise DataError(f"power_ratio: has shape {ratio.shape}; give one number or {regions}")
+    bad = ~((ratio > 1 / LARGEST_RATIO) & (ratio < LARGEST_RATIO))
+    if bad.any():
+        raise DataError(
+            f"power_ratio = {ratio[bad].flat[0]:g}: give the light after over that before, above 0 "
+            f"and below {LARGEST_RATIO:g}"
+        )
+    return np.array(np.broadcast_to(ratio, regions))
+
+
+def _require(given: Mapping[str, Any]) -> None:
     """Refuse a choice of arguments that does not describe regions."""
     light: tuple[str, ...] = ("before", "n_before", "n_after")
     wanted = (*light, "after")
     if given["contrast"] is not None:
         wanted = ("contrast", *(light if given["sigma"] is None else ("sigma",)))
-    allowed = {*wanted, *(("power_ratio",) if "before" in wanted else ())}
+    allowed = {*wanted, "level", "masked", "saturated"}
+    allowed |= {"power_ratio"} if "before" in wanted else set()
     missing = [name for name in given if name in wanted and given[name] is None]
     needless = [name for name, value in given.items() if value is not None and name not in allowed]
     if missing or needless:

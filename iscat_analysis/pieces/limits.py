@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from iscat_analysis.bounds import event_bounds, quantum_bounds, quantum_information
 from iscat_analysis.bounds.experiment import expected_likelihood
-from iscat_analysis.config import Calibration, CameraConfig, Config, Optics, Particle
+from iscat_analysis.config import CameraConfig, Config, Optics, Particle
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import number_in, truth_in
 from iscat_analysis.inference.likelihood import LEVEL
@@ -21,21 +22,15 @@ from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.optics.model import collected_area_nm2, photons_per_intensity
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.optics.scatterers import ANGLES, Rod
+from iscat_analysis.options import takes
 from iscat_analysis.pieces.counts import LARGEST_REGION, config_of, darkfield_photons, together
-from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
+from iscat_analysis.pieces.groups import BoundOptions, QuantumOptions, SquareOptions
+from iscat_analysis.records import PARAMETERS, FloatArray
 
 
+@takes(SquareOptions)
 def psf(
-    optics: Optics,
-    particle: Particle,
-    camera: CameraConfig,
-    *,
-    pixels: int = 33,
-    x_nm: ArrayLike = 0.0,
-    y_nm: ArrayLike = 0.0,
-    z_nm: ArrayLike | None = None,
-    mass_kda: ArrayLike | None = None,
-    calibration: Calibration | None = None,
+    optics: Optics, particle: Particle, camera: CameraConfig, **options: Unpack[SquareOptions]
 ) -> FloatArray:
     """Draw the image that a camera expects of a particle.
 
@@ -86,15 +81,14 @@ def psf(
     (5, 33, 33)
     """
     mode = "size" if isinstance(particle, Particle) and particle.is_sphere else "joint"
-    config = config_of(optics, particle, camera, mode=mode, calibration=calibration)
-    side = int(number_in("pixels", pixels, least=1, most=LARGEST_REGION, whole=True))
+    config = config_of(optics, particle, camera, mode=mode, calibration=options["calibration"])
+    side = int(number_in("pixels", options["pixels"], least=1, most=LARGEST_REGION, whole=True))
     pixel_nm = float(config.camera.pixel_size_nm or 0.0)
-    height = particle.nominal_height_nm if z_nm is None else z_nm
-    reference = forward_model(config, pixel_nm)
-    mass = reference.material.mass_kda if mass_kda is None else mass_kda
-    at = together(
-        {"x_nm": x_nm, "y_nm": y_nm, "z_nm": height, "mass_kda": mass}, least={"z_nm": 0.0}
-    )
+    usual = _usual_place(config, forward_model(config, pixel_nm))
+    given = {"x_nm": options["x_nm"], "y_nm": options["y_nm"]}
+    given["z_nm"] = _either(options["z_nm"], usual["z_nm"])
+    given["mass_kda"] = _either(options["mass_kda"], usual["mass_kda"])
+    at = together(given, least={"z_nm": 0.0})
     half = side * pixel_nm / 2
     reach = math.hypot(*(half + np.abs(at[name]).max(initial=0.0) for name in ("x_nm", "y_nm")))
     highest = max(float(at["z_nm"].max(initial=0.0)), particle.nominal_height_nm)
@@ -108,24 +102,16 @@ def psf(
     return out
 
 
+@takes(BoundOptions)
 def crb(
     optics: Optics,
     particle: Particle,
     camera: CameraConfig,
     *,
     photons_per_pixel: ArrayLike,
-    n_after: ArrayLike = 1,
-    n_before: ArrayLike = 0,
-    mode: str = "mass",
     joint: bool = True,
     level: bool = False,
-    pixels: int = 33,
-    x_nm: ArrayLike = 0.0,
-    y_nm: ArrayLike = 0.0,
-    z_nm: ArrayLike | None = None,
-    mass_kda: ArrayLike | None = None,
-    focus_nm: ArrayLike | None = None,
-    calibration: Calibration | None = None,
+    **options: Unpack[BoundOptions],
 ) -> dict[str, FloatArray]:
     """Cramér–Rao bounds: the smallest standard deviations of unbiased estimates from such frames.
 
@@ -191,24 +177,19 @@ def crb(
     >>> bounds["z_nm"].shape
     (2, 3)
     """
-    config = config_of(optics, particle, camera, mode=mode, calibration=calibration)
-    side = int(number_in("pixels", pixels, least=2, most=LARGEST_REGION, whole=True))
-    given = {
-        "x_nm": x_nm, "y_nm": y_nm, "z_nm": z_nm, "mass_kda": mass_kda, "focus_nm": focus_nm,
-        "photons_per_pixel": photons_per_pixel, "n_after": n_after, "n_before": n_before,
-    }  # fmt: skip
-    setups = _Setups(config, side, given)
+    given = {**options, "photons_per_pixel": photons_per_pixel}
+    setups = _Setups(optics, particle, camera, given)
     joint, level = truth_in("joint", joint), truth_in("level", level)
-    free = FREE_PARAMETERS[mode] + (ANGLES if particle.is_rod else ())
+    free = setups.free + (ANGLES if particle.is_rod else ())
     index = [(*PARAMETERS, *ANGLES).index(name) for name in free]
-    read_noise_e = float(config.camera.assumed.read_noise_e)
-    out = np.full((len(free), *setups.shape), np.nan)
-    for place in np.ndindex(setups.shape):
-        at = setups.at(place)
+    read_noise_e = float(camera.assumed.read_noise_e)
+
+    def bound(at: _At) -> FloatArray:
+        setup = at.model, setups.grid, at.theta, at.level_e, at.scale_e
+        n_before, n_after = int(at.n_before), int(at.n_after)
         likelihood = expected_likelihood(
-            at.model, setups.grid, at.theta, at.level_e, at.scale_e,
-            n_before=int(at.n_before), n_after=int(at.n_after), read_noise_e=read_noise_e,
-        )  # fmt: skip
+            *setup, n_before=n_before, n_after=n_after, read_noise_e=read_noise_e
+        )
         rod = at.model.aperture.scatterer
         if isinstance(rod, Rod):
             every = np.insert(at.theta, LEVEL, [rod.azimuth_deg, rod.tilt_deg])
@@ -216,23 +197,20 @@ def crb(
             bounds = event_bounds(of_rods, every, free, level=level)
         else:
             bounds = event_bounds(likelihood, at.theta, free, at.collected, level=level)
-        out[(slice(None), *place)] = (bounds.crb_joint if joint else bounds.crb_single)[index]
-    return {name: np.asarray(values) for name, values in zip(free, out, strict=True)}
+        return (bounds.crb_joint if joint else bounds.crb_single)[index]
+
+    return setups.bounds(free, bound)
 
 
+@takes(QuantumOptions)
 def qcrb(
     optics: Optics,
     particle: Particle,
     camera: CameraConfig,
     *,
     photons_per_pixel: ArrayLike,
-    n_after: ArrayLike = 1,
-    mode: str = "mass",
     joint: bool = False,
-    z_nm: ArrayLike | None = None,
-    mass_kda: ArrayLike | None = None,
-    focus_nm: ArrayLike | None = None,
-    calibration: Calibration | None = None,
+    **options: Unpack[QuantumOptions],
 ) -> dict[str, FloatArray]:
     """Quantum Cramér–Rao bounds: the smallest standard deviations for any measurement of the light.
 
@@ -282,27 +260,23 @@ def qcrb(
     >>> float(limit["x_nm"][0] / limit["x_nm"][1])
     2.0
     """
-    config = config_of(optics, particle, camera, mode=mode, calibration=calibration)
-    given = {
-        "x_nm": 0.0, "y_nm": 0.0, "z_nm": z_nm, "mass_kda": mass_kda, "focus_nm": focus_nm,
-        "photons_per_pixel": photons_per_pixel, "n_after": n_after, "n_before": 0,
-    }  # fmt: skip
-    setups = _Setups(config, 2, given)
+    given = {**options, "photons_per_pixel": photons_per_pixel}
+    setups = _Setups(
+        optics, particle, camera, {**given, "x_nm": 0.0, "y_nm": 0.0, "n_before": 0, "pixels": 2}
+    )
     joint = truth_in("joint", joint)
-    free = FREE_PARAMETERS[mode]
-    index = [PARAMETERS.index(name) for name in free]
+    index = [PARAMETERS.index(name) for name in setups.free]
     is_mass = np.array(index) == PARAMETERS.index("mass_kda")
-    out = np.full((len(free), *setups.shape), np.nan)
-    for place in np.ndindex(setups.shape):
-        at = setups.at(place)
+
+    def bound(at: _At) -> FloatArray:
         information = quantum_information(at.model, float(at.theta[2]))[np.ix_(index, index)]
-        bound = quantum_bounds(information)[joint]
         # photons are as a², and the information is of ln a: that of the mass is finite at a = 0
         amplitude = abs(float(at.theta[3]))
         shift = 1 / amplitude if amplitude else np.nan
         units = np.where(is_mass, abs(at.model.scale.slope(float(at.theta[3]))), shift)
-        out[(slice(None), *place)] = bound * units / math.sqrt(at.collected_per_a2)
-    return {name: np.asarray(values) for name, values in zip(free, out, strict=True)}
+        return np.asarray(quantum_bounds(information)[joint] * units / at.collected_per_a2**0.5)
+
+    return setups.bounds(setups.free, bound)
 
 
 @dataclass(frozen=True)
@@ -323,25 +297,39 @@ class _At:
         return self.collected_per_a2 * float(self.theta[3]) ** 2
 
 
+_LEAST = {"z_nm": 0.0, "photons_per_pixel": 0.0, "n_after": 1.0, "n_before": 0.0}
+
+
+def _usual_place(config: Config, model: ForwardModel) -> dict[str, float]:
+    """Give height, mass and focus where none are given."""
+    height, focus = config.particle.nominal_height_nm, config.optics.focus_nm
+    return {"z_nm": height, "mass_kda": model.material.mass_kda, "focus_nm": focus}
+
+
+def _either(given: ArrayLike | None, usual: float) -> ArrayLike:
+    return usual if given is None else given
+
+
 class _Setups:
     """Broadcast set-ups; models are shared between those of one focus."""
 
-    def __init__(self, config: Config, pixels: int, given: Mapping[str, ArrayLike | None]) -> None:
-        self._config = config
+    def __init__(
+        self, optics: Optics, particle: Particle, camera: CameraConfig, given: Mapping[str, Any]
+    ) -> None:
+        mode, line = given["mode"], given["calibration"]
+        config = self._config = config_of(optics, particle, camera, mode=mode, calibration=line)
+        self.free = config.fit.free
+        side = number_in("pixels", given["pixels"], least=2, most=LARGEST_REGION, whole=True)
         self._pixel_nm = float(config.camera.pixel_size_nm or 0.0)
-        self.grid = PixelGrid.centred(pixels, self._pixel_nm)
+        self.grid = PixelGrid.centred(int(side), self._pixel_nm)
         self._dark = not config.optics.interferes
         # a calibration was measured at the focus of `optics`, not at the focus of the set-up
         nominal = forward_model(config, self._pixel_nm)
         self._scale = nominal.scale
-        usual = {
-            "z_nm": config.particle.nominal_height_nm,
-            "mass_kda": nominal.material.mass_kda,
-            "focus_nm": config.optics.focus_nm,
-        }
-        whole = {k: usual[k] if value is None else value for k, value in given.items()}
-        least = {"z_nm": 0.0, "photons_per_pixel": 0.0, "n_after": 1.0, "n_before": 0.0}
-        self._all = together(whole, least=least)
+        usual = _usual_place(config, nominal)
+        whole = {name: given[name] for name in ("x_nm", "y_nm", *_LEAST)}
+        whole |= {name: _either(given[name], value) for name, value in usual.items()}
+        self._all = together(whole, least=_LEAST)
         for name in ("n_after", "n_before"):
             broken = self._all[name] != np.round(self._all[name])
             if broken.any():
@@ -353,13 +341,13 @@ class _Setups:
                 "photons_per_pixel = 0: without background there is no interference; give the "
                 'photoelectrons per pixel and frame, or Optics(scheme="darkfield")'
             )
-        half = pixels * self._pixel_nm / 2
+        half = side * self._pixel_nm / 2
         for name in ("x_nm", "y_nm"):
             outside = np.abs(self._all[name]) > half
             if outside.any():
                 raise ConfigError(
                     f"{name} = {self._all[name][outside].flat[0]:g} lies outside the region of "
-                    f"±{half:g} nm: move the particle, or enlarge pixels = {pixels}"
+                    f"±{half:g} nm: move the particle, or enlarge pixels = {side:g}"
                 )
         self.shape = self._all["x_nm"].shape
         far = [half + float(np.abs(self._all[name]).max(initial=0.0)) for name in ("x_nm", "y_nm")]
@@ -367,6 +355,15 @@ class _Setups:
         highest = float(self._all["z_nm"].max(initial=0.0))
         self._highest_nm = max(highest, config.particle.nominal_height_nm)
         self._model = memoize(64, self._at_focus)
+
+    def bounds(
+        self, free: Sequence[str], bound: Callable[[_At], FloatArray]
+    ) -> dict[str, FloatArray]:
+        """Give the bounds of the free parameters by name, of every set-up."""
+        out = np.full((len(free), *self.shape), np.nan)
+        for place in np.ndindex(self.shape):
+            out[(slice(None), *place)] = bound(self.at(place))
+        return {name: np.asarray(values) for name, values in zip(free, out, strict=True)}
 
     def at(self, place: tuple[int, ...]) -> _At:
         """Give the set-up at an index."""

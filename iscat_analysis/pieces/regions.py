@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import pandas as pd
@@ -13,14 +13,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.bounds import event_bounds
 from iscat_analysis.bounds.classical import ComplexArray
-from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle, refuse_rod
+from iscat_analysis.config import CameraConfig, Config, Optics, Particle, refuse_rod
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in, real_array
 from iscat_analysis.inference.fit import compile_kernels, fit_particle, parts_of, without_particle
 from iscat_analysis.inference.heights import has_prior, height_prior
 from iscat_analysis.inference.likelihood import LARGEST_LEVEL, LEVEL, Likelihood
 from iscat_analysis.optics.sized import SeatedModel, SizedModel
+from iscat_analysis.options import only, takes
 from iscat_analysis.pieces.counts import Counts, config_of, gather
+from iscat_analysis.pieces.groups import (
+    FitOptions,
+    ImageOptions,
+    LightOptions,
+    LikelihoodOptions,
+    ModelOptions,
+)
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     PARAMETERS,
@@ -48,26 +56,14 @@ EDGE_SHARE = 0.15
 """Share of the region's side at each edge where a particle is not looked for."""
 
 
+@takes(FitOptions)
 def fit_rois(
     before: ArrayLike | None = None,
     after: ArrayLike | None = None,
     optics: Optics | None = None,
     particle: Particle | None = None,
     camera: CameraConfig | None = None,
-    *,
-    contrast: ArrayLike | None = None,
-    sigma: ArrayLike | None = None,
-    n_after: int | None = None,
-    n_before: int | None = None,
-    mode: str = "mass",
-    power_ratio: ArrayLike | None = None,
-    level: bool | None = None,
-    z_range_nm: tuple[float, float] = (0.0, 1000.0),
-    masked: ArrayLike | None = None,
-    saturated: ArrayLike | None = None,
-    corners_px: ArrayLike | None = None,
-    calibration: Calibration | None = None,
-    workers: int = 1,
+    **options: Unpack[FitOptions],
 ) -> pd.DataFrame:
     """Fit one particle in each of many regions, from counts or from contrast images.
 
@@ -160,23 +156,18 @@ def fit_rois(
     >>> abs(table.mass_kda[0] - 480) < 4 * table.sigma_mass_kda[0]
     np.True_
     """
-    config = config_of(
-        optics, particle, camera, mode=mode, z_range_nm=z_range_nm, calibration=calibration
-    )
+    model: Any = only(ModelOptions, options)
+    config = _of_frames(config_of(optics, particle, camera, **model))
     refuse_rod(config, "its direction has to be fitted too")
-    if config.fit.follows_tracks:
-        raise ConfigError('mode = "track" links frames: give "joint", frame by frame')
-    counts = gather(
-        config, before, after, contrast=contrast, sigma=sigma, n_before=n_before, n_after=n_after,
-        power_ratio=power_ratio, level=level, masked=masked, saturated=saturated,
-    )  # fmt: skip
+    counts = gather(config, before, after, **only(ImageOptions, options))
     count = len(counts.after)
+    corners_px = options["corners_px"]
     corners = np.zeros((count, 2)) if corners_px is None else real_array("corners_px", corners_px)
     if corners.shape != (count, 2) or not np.all(np.isfinite(corners)):
         raise DataError(f"corners_px: has shape {corners.shape}; give {(count, 2)} finite numbers")
-    n_threads = int(number_in("workers", workers, least=1, whole=True))
+    n_threads = int(number_in("workers", options["workers"], least=1, whole=True))
     templates = templates_of(counts)
-    parts = parts_of(FREE_PARAMETERS[mode], heights=has_prior(config), posteriors=False)
+    parts = parts_of(config.fit.free, heights=has_prior(config), posteriors=False)
     compile_kernels(counts.model, parts)
     with threads(n_threads) as pool:
         rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
@@ -185,6 +176,13 @@ def fit_rois(
         table = with_diameters(table, config.particle.density)
     refused = bool(counts.model.scale.refusal)
     return flagged(table, Status.UNCALIBRATED_OPTICS) if refused else table
+
+
+def _of_frames(config: Config) -> Config:
+    """Refuse the mode that is of tracks."""
+    if config.fit.follows_tracks:
+        raise ConfigError('mode = "track" links frames: give "joint", frame by frame')
+    return config
 
 
 def templates_of(counts: Counts) -> Templates:
@@ -205,28 +203,21 @@ def line_of(
     likelihood: Likelihood,
     fit: FitResult,
     collected: float,
-    *,
     flags: Iterable[Status],
-    frame: int | None,
-    n_before: int,
-    n_after: int,
+    *,
     sign: int = 1,
     quantum: ComplexArray | None = None,
 ) -> dict[str, Any]:
-    """Put a fit and its bounds into a row of the table, which has no number yet.
+    """Put a fit and its bounds into a row of the table, which has no number and no frames yet.
 
     Shapes: `quantum` (4, 4).
     """
     model, pixel_nm = likelihood.model, likelihood.grid.pixel_nm
+    level = bool(fit.box.free[LEVEL])
     bounds = event_bounds(
-        likelihood, fit.estimate, fit.free, collected, quantum=quantum,
-        level=bool(fit.box.free[LEVEL]),
-    )  # fmt: skip
-    status, noticed = verdict(flags)
+        likelihood, fit.estimate, fit.free, collected, quantum=quantum, level=level
+    )
     row: dict[str, Any] = {
-        "frame": frame,
-        "n_before": n_before,
-        "n_after": n_after,
         "x_px": fit.x_nm / pixel_nm,
         "y_px": fit.y_nm / pixel_nm,
         "x_nm": fit.x_nm,
@@ -238,8 +229,7 @@ def line_of(
         "snr": fit.snr,
         "chi2_reduced": fit.chi2_reduced,
         "p_value": fit.p_value,
-        "status": str(status),
-        "flags": ";".join(str(flag) for flag in noticed),
+        **_status_of(flags),
     }
     for k, name in enumerate(PARAMETERS):
         row[f"sigma_{name}"] = fit.sigma[k]
@@ -250,6 +240,11 @@ def line_of(
     if not isinstance(model, SizedModel):
         return row
     return row | sizes_of(model, fit) | _index_of(model, fit)
+
+
+def _status_of(flags: Iterable[Status]) -> dict[str, str]:
+    status, noticed = verdict(flags)
+    return {"status": str(status), "flags": ";".join(str(flag) for flag in noticed)}
 
 
 def _index_of(model: SizedModel, fit: FitResult) -> dict[str, float]:
@@ -300,16 +295,11 @@ def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -
     likelihood = counts.likelihood(index)
     config, model, pixel_nm = counts.config, counts.model, counts.grid.pixel_nm
     saturated = counts.saturated[index]
+    frames = {"frame": None, "n_before": counts.n_before, "n_after": counts.n_after}
     # half of the pixels must be usable
     if likelihood.n_pixels < 0.5 * saturated.size:
         flags = [Status.NOT_CONVERGED, *([Status.SATURATED] if saturated.any() else [])]
-        status, noticed = verdict(flags)
-        return {
-            "n_before": counts.n_before,
-            "n_after": counts.n_after,
-            "status": str(status),
-            "flags": ";".join(str(flag) for flag in noticed),
-        }
+        return frames | _status_of(flags)
     start = _start(likelihood, templates, level=counts.level)
     free = FREE_PARAMETERS[config.fit.mode]
     if "mass_kda" not in free:
@@ -328,10 +318,8 @@ def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -
     if saturated_near(saturated, fit.x_nm, fit.y_nm, pixel_nm):
         flags.append(Status.SATURATED)
     collected = counts.collected(index, fit.z_nm, fit.mass_kda)
-    return line_of(
-        likelihood, fit.shifted(corner[1] * pixel_nm, corner[0] * pixel_nm), collected,
-        flags=flags, frame=None, n_before=counts.n_before, n_after=counts.n_after,
-    )  # fmt: skip
+    there = fit.shifted(corner[1] * pixel_nm, corner[0] * pixel_nm)
+    return frames | line_of(likelihood, there, collected, flags)
 
 
 def saturated_near(
@@ -513,21 +501,14 @@ class LogLikelihood:
         return inner
 
 
+@takes(LikelihoodOptions)
 def log_likelihood(
     before: ArrayLike,
     after: ArrayLike,
     optics: Optics,
     particle: Particle,
     camera: CameraConfig,
-    *,
-    n_after: int,
-    n_before: int,
-    mode: str = "mass",
-    power_ratio: float | None = None,
-    level: bool | None = None,
-    z_range_nm: tuple[float, float] = (0.0, 1000.0),
-    masked: ArrayLike | None = None,
-    calibration: Calibration | None = None,
+    **options: Unpack[LikelihoodOptions],
 ) -> LogLikelihood:
     """Give the log-likelihood of a region as a function of the particle in it.
 
@@ -592,26 +573,20 @@ def log_likelihood(
     >>> bool(logl(at) > logl([900.0, 844.0, 48_700.0])), logl.gradient(at).shape
     (True, (3,))
     """
-    config = config_of(
-        optics, particle, camera, mode=mode, z_range_nm=z_range_nm, calibration=calibration
-    )
+    model_of: Any = only(ModelOptions, options)
+    config = _of_frames(config_of(optics, particle, camera, **model_of))
     refuse_rod(config, "the angles are no parameters of log_likelihood")
-    if config.fit.follows_tracks:
-        raise ConfigError('mode = "track" links frames: give "joint", frame by frame')
     image, known = real_array("after", after), real_array("before", before)
     if image.ndim != 2:
         raise DataError(f"after: has shape {image.shape}; give one region as (y, x)")
-    counts = gather(
-        config, known if known.ndim < 2 else known[None], image[None],
-        n_before=n_before, n_after=n_after, power_ratio=power_ratio, level=level, masked=masked,
-    )  # fmt: skip
-    model, grid = counts.model, counts.grid
+    background = known if known.ndim < 2 else known[None]
+    counts = gather(config, background, image[None], **only(LightOptions, options))
+    model, grid, names = counts.model, counts.grid, config.fit.free
     half = grid.pixel_nm / 2
     z_low_nm, z_high_nm = config.fit.z_range_nm
-    signed = "z_nm" not in FREE_PARAMETERS[mode] and model.rho > 0
+    signed = "z_nm" not in names and model.rho > 0
     lower = [grid.x_nm[0] - half, grid.y_nm[0] - half, z_low_nm, -np.inf if signed else 0.0]
     upper = [grid.x_nm[-1] + half, grid.y_nm[-1] + half, z_high_nm, np.inf]
-    names = FREE_PARAMETERS[mode]
     free = [PARAMETERS.index(name) for name in names]
     if counts.level:
         names, free = (*names, "log_level"), [*free, LEVEL]

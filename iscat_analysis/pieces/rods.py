@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import pandas as pd
@@ -26,26 +26,25 @@ from iscat_analysis.inference.models import TurningRod
 from iscat_analysis.inference.sizes import AMBIGUITY_ODDS
 from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.optics.scatterers import Rod, rod_of
+from iscat_analysis.options import takes
 from iscat_analysis.pieces.counts import config_of, gather
+from iscat_analysis.pieces.groups import LightOptions
 from iscat_analysis.pieces.regions import EDGE_SHARE
 from iscat_analysis.records import Box, FloatArray, Status, verdict
 
 AMPLITUDE, AZIMUTH, TILT = 3, 4, 5
+_OTHER = ("azimuth_deg", "tilt_deg", "mass_kda")
 _NAMES = {"x_nm": 0, "y_nm": 1, "mass_kda": AMPLITUDE, "azimuth_deg": AZIMUTH, "tilt_deg": TILT}
 
 
+@takes(LightOptions)
 def fit_rods(
     before: ArrayLike,
     after: ArrayLike,
     optics: Optics,
     particle: Particle,
     camera: CameraConfig,
-    *,
-    n_after: int,
-    n_before: int,
-    power_ratio: ArrayLike | None = None,
-    level: bool | None = None,
-    masked: ArrayLike | None = None,
+    **options: Unpack[LightOptions],
 ) -> pd.DataFrame:
     """Fit place, mass and direction of one rod in each of many regions.
 
@@ -108,11 +107,7 @@ def fit_rods(
     >>> abs(table.azimuth_deg[0] - 30) < 4 * table.sigma_azimuth_deg[0]
     np.True_
     """
-    config = config_of(optics, particle, camera, mode="mass")
-    counts = gather(
-        config, before, after, n_before=n_before, n_after=n_after, power_ratio=power_ratio,
-        level=level, masked=masked,
-    )  # fmt: skip
+    counts = gather(config_of(optics, particle, camera, mode="mass"), before, after, **options)
     model = counts.model
     rod = rod_of(particle, model.material.permittivity, optics.n_sample)
     if rod is None:
@@ -132,32 +127,26 @@ def _row(likelihood: Likelihood, found: list[ModelFit], rod: Rod) -> dict[str, A
     """Put the maxima of one region into a row."""
     best, *others = found
     chi2, p_value = judge(likelihood, best, rod)
-    odds, other = math.nan, np.full(len(best.theta), math.nan)
+    odds, other = 0.0, np.full(len(best.theta), math.nan)
     if others:
-        odds = math.exp(others[0].log_likelihood - best.log_likelihood)
-        other = others[0].theta
-    flags = []
-    if not best.converged:
-        flags.append(Status.NOT_CONVERGED)
-    if p_value < POOR_FIT_P:
-        flags.append(Status.POOR_FIT)
-    wide = max(best.sigma[TILT], best.sigma[AZIMUTH] * math.sin(math.radians(best.theta[TILT])))
-    # Error of the direction above which it is flagged as well: it is no longer normal
-    if odds > 1 / AMBIGUITY_ODDS or not wide < 5.0:
-        flags.append(Status.AMBIGUOUS_DIRECTION)
-    values = {name: float(best.theta[k]) for name, k in _NAMES.items()}
-    sigmas = {f"sigma_{name}": float(best.sigma[k]) for name, k in _NAMES.items()}
+        odds, other = math.exp(others[0].log_likelihood - best.log_likelihood), others[0].theta
+    across = best.sigma[AZIMUTH] * math.sin(math.radians(best.theta[TILT]))
+    # an error of the direction above 5° is no longer normal
+    unsure = odds > 1 / AMBIGUITY_ODDS or not max(best.sigma[TILT], across) < 5.0
+    possible = (
+        (not best.converged, Status.NOT_CONVERGED),
+        (p_value < POOR_FIT_P, Status.POOR_FIT),
+        (unsure, Status.AMBIGUOUS_DIRECTION),
+    )
     return {
-        **values,
-        **sigmas,
+        **{name: float(best.theta[k]) for name, k in _NAMES.items()},
+        **{f"sigma_{name}": float(best.sigma[k]) for name, k in _NAMES.items()},
         "maxima": len(found),
-        "other_azimuth_deg": float(other[AZIMUTH]),
-        "other_tilt_deg": float(other[TILT]),
-        "other_mass_kda": float(other[AMPLITUDE]),
-        "other_odds": odds,
+        **{f"other_{name}": float(other[_NAMES[name]]) for name in _OTHER},
+        "other_odds": odds if others else math.nan,
         "chi2_reduced": chi2,
         "p_value": p_value,
-        "status": str(verdict(flags)[0]),
+        "status": str(verdict([flag for true, flag in possible if true])[0]),
     }
 
 
@@ -260,5 +249,4 @@ def _distinct(found: list[ModelFit]) -> list[ModelFit]:
 def _same(one: ModelFit, other: ModelFit) -> bool:
     cosine = min(abs(float(axis_of(one.theta) @ axis_of(other.theta))), 1.0)
     gap = abs(one.log_likelihood - other.log_likelihood)
-    # one maximum, found twice
     return math.degrees(math.acos(cosine)) < 3.0 and gap < 0.1

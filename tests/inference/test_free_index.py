@@ -44,13 +44,8 @@ def fits_of(
     taken_for = ia.Particle(
         kind="custom", index=index, density_kg_m3=DENSITY, model="mie", diameter_nm=diameter_nm
     )
-    config = config_of(
-        OPTICS, taken_for, CAMERA, mode="size", z_range_nm=Z_RANGE_NM, calibration=None
-    )
-    counts = gather(
-        config, before, after, n_before=100, n_after=100, power_ratio=1.0, level=None,
-        masked=None, saturated=None,
-    )  # fmt: skip
+    config = config_of(OPTICS, taken_for, CAMERA, mode="size", z_range_nm=Z_RANGE_NM)
+    counts = gather(config, before, after, n_before=100, n_after=100, power_ratio=1.0)
     found = []
     for number in range(n):
         likelihood = counts.likelihood(number)

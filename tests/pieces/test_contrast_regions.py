@@ -50,8 +50,7 @@ def _snr_of_one_kda(**light: Any) -> float:
 def test_the_likelihood_of_contrasts_is_normal() -> None:
     config = config_of(OPTICS, PROTEIN, CAMERA, mode="mass", calibration=LINE)
     seen = _images(1, 1)
-    counts = gather(config, None, None, contrast=seen, sigma=_sigma(), n_before=None, n_after=None,
-                    power_ratio=None, level=None, masked=None)  # fmt: skip
+    counts = gather(config, None, None, contrast=seen, sigma=_sigma())
     model, grid = counts.model, PixelGrid.region((0, PIXELS), (0, PIXELS), 84.4)
     likelihood = gaussian(model, grid, seen[0], _sigma())
     amplitude = model.scale.amplitude(480.0)
