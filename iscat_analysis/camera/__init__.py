@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 from iscat_analysis.camera.background import (
-    DEAD,
-    DEFECT_SIGMAS,
-    HOT,
     Check,
     add_frames,
-    find_defects,
     measure_windows,
     refine_power,
     smooth_background,
@@ -19,8 +15,6 @@ from iscat_analysis.camera.counts import (
     Camera,
     camera_from_config,
     check_counts,
-    converter_ceiling,
-    padded_bits,
     read_map,
     refuse_overflow,
     refuse_ratio,
@@ -49,34 +43,22 @@ from iscat_analysis.camera.field_sample import (
 from iscat_analysis.camera.gain import (
     GainDiagnosis,
     diagnose_gain,
-    measure_pattern_jitter,
     shared_light,
-    with_pattern_jitter,
     without_pattern_jitter,
 )
-from iscat_analysis.camera.laws import Law, Response, find_law, read_response
+from iscat_analysis.camera.laws import Law, Response
 from iscat_analysis.camera.learned import (
     ASSUMPTION,
     MEASURED,
     METADATA,
     LearnedCamera,
-    learn_camera,
     resolve_metadata,
     with_camera,
 )
-from iscat_analysis.camera.light import (
-    Fringes,
-    LightModel,
-    PartOfLight,
-    Seams,
-    Smooth,
-    SteadyFrames,
-    with_lines,
-)
+from iscat_analysis.camera.light import LightModel, PartOfLight, SteadyFrames, with_lines
 from iscat_analysis.camera.light_search import find_light
+from iscat_analysis.camera.moments import find_defects
 from iscat_analysis.camera.pixels import (
-    boxes_of,
-    find_text,
     find_unsteady,
     text_finding,
     text_summary,
@@ -86,4 +68,4 @@ from iscat_analysis.camera.pixels import (
 from iscat_analysis.camera.processed import Processing, find_processing
 from iscat_analysis.camera.regression import CameraCalibration, Estimate
 from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
-from iscat_analysis.camera.transfer import SIGMAS, TOLERANCE, LightZero, find_zero, measure_transfer
+from iscat_analysis.camera.transfer import SIGMAS, TOLERANCE, LightZero, find_zero

@@ -20,7 +20,7 @@ frame, which needs no offset.  Rounding to whole counts is part of the read nois
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -56,13 +56,8 @@ from iscat_analysis.movie import SelectedFrames
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress, silent
 from iscat_analysis.units import listed
 
-LEAST_EXCESS_VARIANCE = 0.10
-"""Noise variance above shot noise by more than this, and three standard errors, is a limit."""
-
-NOISE_COLUMNS = (
-    "n_frames", "contrast_noise", "contrast_noise_se", "shot_noise", "excess", "excess_se",
-    "comparisons",
-)  # fmt: skip
+_CONTRASTS = ("contrast_noise", "contrast_noise_se", "shot_noise")
+NOISE_COLUMNS = ("n_frames", *_CONTRASTS, "excess", "excess_se", "comparisons")
 """Columns of `CameraCalibration.noise`."""
 
 
@@ -84,71 +79,62 @@ def noise_curve(
         light = np.maximum(light, 0.05 * light.mean())
     predicted = np.maximum(result.intercept + result.slope * found.mean[used], 1e-12) / light**2
     shot = result.slope / light
-    levels = int(math.log2(frames // 2))
-    # at each length: more would not narrow the curve noticeably
-    strides = [max(1, -(-(frames // 2**j - 1) // 64)) for j in range(levels + 1)]
-    waiting: list[FloatArray | None] = [None] * (levels + 1)
-    last: list[FloatArray | None] = [None] * (levels + 1)
-    seen = [0] * (levels + 1)
-    ratios: list[list[float]] = [[] for _ in range(levels + 1)]
-    for start, stop in blocks(stack):
-        block = stack.read(start, stop)[:, used].astype(np.float64)
-        for frame in block:
-            total: FloatArray | None = frame - result.offset.value
-            for j in range(levels + 1):
-                if total is None:
-                    break
-                earlier = last[j]
-                if earlier is not None and (seen[j] - 1) % strides[j] == 0:
-                    contrast = total / earlier * (earlier.sum() / total.sum()) - 1
-                    z = np.abs(contrast - np.median(contrast))
-                    z /= np.sqrt(2 * predicted / 2**j)
-                    ratios[j].append(robust_sigma(z) ** 2)
-                last[j] = total
-                seen[j] += 1
-                pair = waiting[j]
-                waiting[j] = total if pair is None else None
-                total = None if pair is None else pair + total
-        progress("noise curve", stop, frames)
+    ratios: list[list[float]] = [[] for _ in range(int(math.log2(frames // 2)) + 1)]
+
+    def compared(sums: Iterator[FloatArray], n: int, found: list[float]) -> Iterator[FloatArray]:
+        """Compare successive sums of n frames, and go on with those of 2 n."""
+        stride = max(1, -(-(frames // n - 1) // 64))  # more would not narrow the curve noticeably
+        earlier = np.empty(0)
+        for number, total in enumerate(sums):
+            if number and (number - 1) % stride == 0:
+                contrast = total / earlier * (earlier.sum() / total.sum()) - 1
+                z = np.abs(contrast - np.median(contrast)) / np.sqrt(2 * predicted / n)
+                found.append(robust_sigma(z) ** 2)
+            if number % 2:
+                yield earlier + total
+            earlier = total
+
+    def single() -> Iterator[FloatArray]:
+        for start, stop in blocks(stack):
+            yield from stack.read(start, stop)[:, used] - result.offset.value
+            progress("noise curve", stop, frames)
+
+    stream = single()
+    for j, found_ratios in enumerate(ratios):
+        stream = compared(stream, 2**j, found_ratios)
+    for _ in stream:
+        pass
     rows = []
-    scale = float(predicted.mean() / shot.mean())
+    scale, mean_shot = float(predicted.mean() / shot.mean()), float(shot.mean())
     for j, values in enumerate(ratios):
         if not values:
             continue
-        n = 2**j
         excess = float(np.mean(values)) * scale
-        pixels = light.size
         # relative standard error of a variance from a median, times √n
-        se = excess * 2.333 * math.sqrt(1.5 / (pixels * len(values)))
-        noise = math.sqrt(2 * float(shot.mean()) / n)
-        rows.append(
-            (n, noise * math.sqrt(excess), noise * se / (2 * math.sqrt(excess)), noise,
-             excess, se, len(values))
-        )  # fmt: skip
+        se = excess * 2.333 * math.sqrt(1.5 / (light.size * len(values)))
+        noise, root = math.sqrt(2 * mean_shot / 2**j), math.sqrt(excess)
+        rows.append((2**j, noise * root, noise * se / (2 * root), noise, excess, se, len(values)))
     return pd.DataFrame(rows, columns=list(NOISE_COLUMNS))
 
 
 def verdict_of(noise: pd.DataFrame) -> tuple[int, str]:
     """Say up to which average the noise is shot noise."""
-    # standard errors
-    within = noise["excess"] <= 1 + LEAST_EXCESS_VARIANCE + 3.0 * noise["excess_se"]
-    first = noise.iloc[0]
+    # 10 % above shot noise, and three standard errors
+    within = noise["excess"] <= 1.1 + 3.0 * noise["excess_se"]
     if not within.iloc[0]:
         return 0, (
-            f"not shot-noise limited: already between single frames the noise variance is "
-            f"{first['excess']:.3g} times that of the photoelectrons"
+            "not shot-noise limited: already between single frames the noise variance is "
+            f"{noise['excess'].iloc[0]:.3g} times that of the photoelectrons"
         )
-    if within.all():
-        longest = noise.iloc[-1]
-        return int(longest["n_frames"]), (
-            f"shot-noise limited up to {int(longest['n_frames'])} averaged frames, the longest "
-            f"average this recording can test (contrast noise {longest['contrast_noise']:.2g})"
-        )
-    stop = int(np.argmin(within.to_numpy()))
-    best, beyond = noise.iloc[stop - 1], noise.iloc[stop]
-    return int(best["n_frames"]), (
-        f"shot-noise limited up to {int(best['n_frames'])} averaged frames (contrast noise "
-        f"{best['contrast_noise']:.2g}); at {int(beyond['n_frames'])} the noise variance is "
+    stop = len(noise) if within.all() else int(np.argmin(within.to_numpy()))
+    best = noise.iloc[stop - 1]
+    frames, reached = int(best["n_frames"]), f"(contrast noise {best['contrast_noise']:.2g})"
+    limited = f"shot-noise limited up to {frames} averaged frames"
+    if stop == len(noise):
+        return frames, f"{limited}, the longest average this recording can test {reached}"
+    beyond = noise.iloc[stop]
+    return frames, (
+        f"{limited} {reached}; at {int(beyond['n_frames'])} the noise variance is "
         f"{beyond['excess']:.3g} times that of the photoelectrons: drift, or particles"
     )
 
@@ -189,20 +175,7 @@ def measure_camera(
     masked = {name: np.zeros(shape, dtype=np.bool_) for name in KINDS}
     dark_found = None
     if dark is not None:
-        dark_found = moments_of(dark, None, advance)
-        masked["hot"] |= stand_out(dark_found.mean) | stand_out(dark_found.variance)
-        masked["dead"] |= dark_found.variance <= 0
-        low = float(np.mean(clipped(dark_found.lowest)))
-        if low > 0.01:  # that are worth a line
-            notes.append(
-                f"{100 * low:.0f} % of the dark's pixels reach zero counts, where noise is cut "
-                "off: its offset is too high and its read noise too small; raise the camera's "
-                "offset"
-            )
-        if masked["dead"].all():
-            raise DataError(
-                f"{dark.name}: every frame is the same: this is not raw camera data; record a dark"
-            )
+        dark_found = _moments_of_dark(dark, masked, notes, advance)
         if not light:
             return _from_dark(dark_found, masked, maps)
 
@@ -226,10 +199,8 @@ def measure_camera(
     spectrum = _spectrum(light[longest], ~used, result)
     if spectrum is not None and any(spectrum.shared):
         lines = "rows" if spectrum.shared[0] >= spectrum.shared[1] else "columns"
-        found = [
-            replace(item, variance=moments_of(stack, used, _nothing, flickering=lines).variance)
-            for stack, item in zip(light, found, strict=True)
-        ]
+        again = (moments_of(stack, used, lambda _: None, flickering=lines) for stack in light)
+        found = [replace(a, variance=b.variance) for a, b in zip(found, again, strict=True)]
         flicker_notes = [
             f"whole {lines} flicker ({100 * max(spectrum.shared):.2g} % of the noise variance); "
             f"the flicker of each of the {lines} was taken out"
@@ -242,12 +213,8 @@ def measure_camera(
         result = _with_neighbours(result, spectrum, notes)
     limit, verdict = verdict_of(noise)
     return CameraCalibration(
-        gain_e_per_adu=result.gain,
-        offset_adu=result.offset,
-        offset_from=result.offset_from,
-        read_noise_adu=result.read_adu,
-        read_noise_e=result.read_e,
-        read_noise_below_e=result.read_below_e,
+        *(result.gain, result.offset, result.offset_from),
+        *(result.read_adu, result.read_e, result.read_below_e),
         curve=_curve(found, used, result, notes),
         noise=noise,
         shot_limited_frames=limit,
@@ -259,20 +226,43 @@ def measure_camera(
     )
 
 
+def _moments_of_dark(
+    dark: FrameSource,
+    masked: dict[str, BoolArray],
+    notes: list[str],
+    advance: Callable[[int], None],
+) -> Moments:
+    """Measure the moments of a dark, and mask its pixels that are hot or dead."""
+    found = moments_of(dark, None, advance)
+    masked["hot"] |= stand_out(found.mean) | stand_out(found.variance)
+    masked["dead"] |= found.variance <= 0
+    low = float(np.mean(clipped(found.lowest)))
+    if low > 0.01:  # that are worth a line
+        notes.append(
+            f"{100 * low:.0f} % of the dark's pixels reach zero counts, where noise is cut off: "
+            "its offset is too high and its read noise too small; raise the camera's offset"
+        )
+    if masked["dead"].all():
+        raise DataError(
+            f"{dark.name}: every frame is the same: this is not raw camera data; record a dark"
+        )
+    return found
+
+
 def _moments_with_light(
     stack: FrameSource, floor: float, masked: dict[str, BoolArray], advance: Callable[[int], None]
 ) -> Moments:
     """Measure the moments of a stack, and add pixels that are not to be used to those masked."""
     first = _glance(stack)
     odd = masked["hot"] | masked["dead"] | saturated(first.max(axis=0), stack.name)
-    lit = ~(odd | unlike_neighbours(first.mean(axis=0) - floor))
+    lit = ~np.logical_or.reduce([odd, *unlike_neighbours(first.mean(axis=0) - floor)])
     measured = moments_of(stack, lit, advance)
     full = saturated(measured.highest, stack.name)
     masked["saturated"] |= full
     masked["clipped"] |= clipped(measured.lowest) & (measured.variance > 0)
-    masked["dead"] |= (measured.variance <= 0) & ~full
-    masked["dead"] |= unlike_neighbours(measured.mean - floor, high=math.inf) & ~full
-    masked["hot"] |= unlike_neighbours(measured.mean - floor, low=-math.inf) & ~full
+    dark, bright = unlike_neighbours(measured.mean - floor)
+    masked["dead"] |= (dark | (measured.variance <= 0)) & ~full
+    masked["hot"] |= bright & ~full
     return measured
 
 
@@ -284,10 +274,6 @@ def _refuse_darker(light: Sequence[FrameSource], found: Sequence[Moments], floor
                 f"{stack.name}: has {np.median(measured.mean):.5g} counts, no more than "
                 f"`offset_adu` = {floor:g}: give the counts that the camera has in the dark"
             )
-
-
-def _nothing(frames: int) -> None:
-    """Tell nobody of frames that are read once more."""
 
 
 def _spectrum(stack: FrameSource, masked: BoolArray, result: Solution) -> NoiseSpectrum | None:
@@ -360,19 +346,13 @@ def _curve(
     for item in found:
         mean, variance = item.mean[used], item.variance[used]
         for part in brightness_bins(mean):
-            rows.append(
-                (
-                    float(mean[part].mean()),
-                    float(variance[part].mean()),
-                    float(variance[part].std(ddof=1)) / math.sqrt(part.size),
-                    result.intercept + result.slope * float(mean[part].mean()),
-                    int(part.size),
-                )
-            )
+            level, values = float(mean[part].mean()), variance[part]
+            se = float(values.std(ddof=1)) / math.sqrt(part.size)
+            fit = result.intercept + result.slope * level
+            rows.append((level, float(values.mean()), se, fit, part.size))
     curve = pd.DataFrame(rows, columns=_CURVE_COLUMNS).sort_values("mean_adu", ignore_index=True)
-    chi2 = float(
-        (((curve["variance_adu2"] - curve["fit_adu2"]) / curve["variance_se"]) ** 2).mean()
-    )
+    residual = (curve["variance_adu2"] - curve["fit_adu2"]) / curve["variance_se"]
+    chi2 = float((residual**2).mean())
     if chi2 > 3.0:  # reduced
         notes.append(
             f"the variance does not follow a straight line (reduced χ² {chi2:.3g}): the camera is "
@@ -391,22 +371,17 @@ def _maps(
     """Make one number per pixel; masked pixels keep that of the whole sensor."""
     gain = result.gain.value
     offset = dark.mean if dark is not None else np.full(used.shape, result.offset.value)
-    read = (
-        dark.variance
-        if dark is not None
-        else np.full(used.shape, max(0.0, result.intercept + result.slope * result.offset.value))
+    read: FloatArray | float = max(0.0, result.intercept + result.slope * result.offset.value)
+    read = dark.variance if dark is not None else read
+    weights = [item.n_frames - 1 for item in found]
+    light, shot = (
+        np.tensordot(weights, each, axes=1)
+        for each in ([m.mean - offset for m in found], [m.variance - read for m in found])
     )
-    light = sum(
-        ((item.n_frames - 1) * (item.mean - offset) for item in found), np.zeros(used.shape)
-    )
-    shot = sum(
-        ((item.n_frames - 1) * (item.variance - read) for item in found), np.zeros(used.shape)
-    )
-    frames = sum(item.n_frames - 1 for item in found)
     good = used & (shot > 0) & (light > 0)
     found_gain = np.full(used.shape, gain)
     found_gain[good] = light[good] / shot[good]
-    expected = math.sqrt(3 / frames)
+    expected = math.sqrt(3 / sum(weights))
     seen = robust_sigma(found_gain[good] / gain - 1)
     own = math.sqrt(max(0.0, seen**2 - expected**2))
     notes.append(
@@ -433,12 +408,7 @@ def _from_dark(dark: Moments, masked: dict[str, BoolArray], maps: bool) -> Camer
     offset, read = dark_numbers(dark, used)
     note = "a dark alone gives no gain, so the read noise is in counts; add a flat or the movie"
     return CameraCalibration(
-        gain_e_per_adu=None,
-        offset_adu=offset,
-        offset_from="dark",
-        read_noise_adu=read,
-        read_noise_e=None,
-        read_noise_below_e=None,
+        *(None, offset, "dark", read, None, None),
         curve=pd.DataFrame(columns=_CURVE_COLUMNS),
         noise=pd.DataFrame(columns=list(NOISE_COLUMNS)),
         shot_limited_frames=None,

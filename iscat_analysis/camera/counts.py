@@ -17,17 +17,14 @@ import numpy as np
 import tifffile
 from numpy.typing import DTypeLike, NDArray
 
-from iscat_analysis.config import CameraConfig
+from iscat_analysis.config import ASSUMED, CameraConfig
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import WHAT_LIBRARIES_RAISE, bytes_are_swapped
 from iscat_analysis.reading import is_file
-from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.records import BoolArray, CountSource, FloatArray
 
 if TYPE_CHECKING:
     from iscat_analysis.camera.laws import Law
-
-CEILING_REPEATS = 4
-"""Counts that must share the largest one before it is taken for a converter's full scale."""
 
 _RATIO_TOLERANCE = 0.1  # of a mean of 1; a power that was not divided out is within it
 _OVERFLOW_JUMP = 0.75  # of the largest number, from one frame to the next
@@ -81,6 +78,34 @@ class Camera:
             if not np.all(most < self.well_depth_e):
                 full |= self.to_electrons(counts) >= self.well_depth_e
         return full
+
+    def steady(self, counts: NDArray[Any]) -> tuple[FloatArray, FloatArray] | None:
+        """Give photoelectrons of frames of one power, and what the powers were; None of the dark.
+
+        Shapes: `counts` (t, ...), results (t, ...) and (t,), of mean 1.
+        """
+        electrons = self.to_electrons(counts)
+        power = electrons.mean(axis=tuple(range(1, counts.ndim)))
+        if power.min(initial=math.inf) <= 0:
+            return None
+        power /= power.mean()
+        electrons /= power.reshape(-1, *[1] * (counts.ndim - 1))
+        return electrons, power
+
+    def usable(self, counts: NDArray[Any], masked: BoolArray | None) -> BoolArray:
+        """Find the pixels that no frame has saturated, and that are not masked.
+
+        Shapes: `counts` (t, y, x), `masked` and result (y, x).
+        """
+        used = ~self.saturated(counts.max(axis=0))
+        return used if masked is None else used & ~masked
+
+    def without_light(self, movie: CountSource) -> NDArray[Any]:
+        """Give the counts that a movie's pixels have in the dark.
+
+        Shapes: result (y, x).
+        """
+        return np.broadcast_to(np.floor(self.offset_adu), movie.shape[1:]).astype(movie.dtype)
 
     def part(self, here: tuple[Any, ...]) -> Camera:
         """Give the camera of some pixels."""
@@ -155,13 +180,8 @@ def padded_bits(counts: NDArray[Any]) -> int:
 def camera_from_config(config: CameraConfig, shape_yx: tuple[int, int], dtype: DTypeLike) -> Camera:
     """Build the camera that a configuration describes, reading its maps."""
     config = config.assumed
-    return Camera(
-        gain_e_per_adu=_number_or_map(config.gain_e_per_adu, "gain_e_per_adu", shape_yx),
-        offset_adu=_number_or_map(config.offset_adu, "offset_adu", shape_yx),
-        read_noise_e=_number_or_map(config.read_noise_e, "read_noise_e", shape_yx),
-        well_depth_e=config.well_depth_e,
-        full_scale_adu=full_scale_of(dtype),
-    )
+    gain, offset, read = (_number_or_map(getattr(config, key), key, shape_yx) for key in ASSUMED)
+    return Camera(gain, offset, read, config.well_depth_e, full_scale_of(dtype))
 
 
 def _number_or_map(value: float | str, key: str, shape_yx: tuple[int, int]) -> float | FloatArray:
@@ -224,16 +244,13 @@ def check_counts(
 
     Shapes: `counts` (t, y, x).
     """
-    if camera is None:
-        camera = Camera(full_scale_adu=full_scale_of(counts.dtype))
-    lowest, highest = counts.min(axis=(1, 2)), counts.max(axis=(1, 2))
+    camera = camera or Camera(full_scale_adu=full_scale_of(counts.dtype))
+    lowest, highest = (extreme(axis=(1, 2)).tolist() for extreme in (counts.min, counts.max))
     floor = _negative_floor_adu(camera, counts.dtype)
     ceiling = _ceiling_adu(camera)
     highest_floor, lowest_ceiling = float(np.max(floor)), float(np.min(ceiling))
-    for number in range(len(counts)):
-        frame = counts[number]
+    for number, (frame, low, high) in enumerate(zip(counts, lowest, highest, strict=True)):
         where = f"{name}: frame {first_frame + number}"
-        low, high = float(lowest[number]), float(highest[number])
         if not (math.isfinite(low) and math.isfinite(high)):
             bad = ~np.isfinite(frame)
             advice = "; leave the frame out or export the movie again"
@@ -356,7 +373,8 @@ def converter_ceiling(counts: NDArray[Any]) -> float:
     top = int(counts.max())
     step = top & -top  # twelve bits may stand in the high bits of sixteen
     full = top // step if top > 0 else 0
-    if full < 255 or full & (full + 1) or np.count_nonzero(counts == top) < CEILING_REPEATS:
+    few = np.count_nonzero(counts == top) < 4  # which may be so by chance
+    if full < 255 or full & (full + 1) or few:
         return math.inf
     if step > 1 and int(np.bitwise_or.reduce(counts, axis=None)) % step:
         return math.inf

@@ -96,16 +96,14 @@ def follow_pattern(
 
     def one(number: int) -> tuple[FloatArray, FloatArray, float]:
         here, before = lit[number], lit[number - 1]
-        return _register(
-            mover, (blocks_e[before] / still)[nearest], blocks_e[here] / still, usable,
-            power[before] * noise, power[here] * noise, float(power[here] / power[before]),
-        )  # fmt: skip
+        pattern, image = (blocks_e[before] / still)[nearest], blocks_e[here] / still
+        reads = power[before] * noise, power[here] * noise
+        return _register(mover, pattern, image, usable, *reads, float(power[here] / power[before]))
 
     found = list(mapper(one, range(1, lit.size)))
     if not found or not np.median([clear for _, _, clear in found]) > 1.0:  # of that of its noise
         return None
-    steps = np.array([step for step, _, _ in found])
-    errors = np.array([error for _, error, _ in found])
+    steps, errors = (np.array([each[k] for each in found]) for k in (0, 1))
     shift = np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
     return Trajectory(frames[lit], shift, np.vstack([errors[:1], errors]))
 
@@ -136,16 +134,9 @@ def _register(
             if np.isnan(some).all():
                 return nowhere
             scale = max(SIGMA_PER_MAD * float(np.nanmedian(some)), 1.0)
-            spurious = shift_equations(
-                moved,
-                pattern_read,
-                image_read,
-                ratio,
-                deviation,
-                4.0 * scale,  # a pixel beyond does not count
-                normal,
-                right,
-            )
+            read = pattern_read, image_read, ratio
+            # a pixel beyond four standard deviations does not count
+            spurious = shift_equations(moved, *read, deviation, 4.0 * scale, normal, right)
             clear = float(normal[0, 0] + normal[1, 1]) / max(2 * spurious, 1e-300)
             if not clear > 0 or np.linalg.eigvalsh(normal)[0] <= 0:
                 return nowhere
@@ -175,11 +166,7 @@ class Mover:
         self._shape = shape
         self._size = tuple(fft.next_fast_len(n + 4 * REACH_PX, real=True) for n in shape)
         self._fy, self._fx = fft.fftfreq(self._size[0]), fft.rfftfreq(self._size[1])
-
-    @property
-    def waves(self) -> tuple[ComplexArray, ComplexArray]:
-        """Factors that differentiate a spectrum by y and by x."""
-        return 2j * np.pi * self._fy[:, None], 2j * np.pi * self._fx[None]
+        self.waves = 2j * np.pi * self._fy[:, None], 2j * np.pi * self._fx[None]
 
     def spectrum(self, image: FloatArray) -> ComplexArray:
         """Spectrum of an image, shape (v, u)."""

@@ -22,12 +22,7 @@ from iscat_analysis.records import CountSource, PlacedSource
 LARGEST_PX = 2**18
 """Pixels of a field, up to which all of them are looked at."""
 
-ALL_COUNTS = 2**23
-"""Counts of whole frames that tell what pixels of a frame have in common: 128 of 256 × 256."""
-
 _SIDE, _ALONG = 64, 4  # of a square, and squares along each axis: together 256 × 256 pixels
-_SEED = 1
-_READ_BYTES = 2**24  # of whole frames that are read at a time
 
 
 @dataclass(frozen=True)
@@ -42,7 +37,7 @@ class FieldSample:
         """Choose squares, always the same in fields of one shape; None where the field is small."""
         if math.prod(shape) <= LARGEST_PX or min(shape) < _SIDE * _ALONG:
             return None
-        rng = np.random.default_rng(_SEED)
+        rng = np.random.default_rng(1)
         edges = [np.linspace(0, size, _ALONG + 1).astype(int) for size in shape]
         corners = [
             (int(rng.integers(top, bottom - _SIDE + 1)), int(rng.integers(left, right - _SIDE + 1)))
@@ -80,15 +75,15 @@ class FieldSample:
 
         Shapes: `counts` (t, 256, 256), `camera` that of the squares.
         """
-        electrons = camera.to_electrons(counts)
-        power = electrons.mean(axis=(1, 2), keepdims=True)
-        electrons /= power / power.mean()
-        shape = (len(counts), _ALONG, _SIDE, _ALONG, _SIDE)
-        read = camera.read_variance_e2((_SIDE * _ALONG, _SIDE * _ALONG))
+        steady = camera.steady(counts)
+        if steady is None:
+            return math.nan, math.nan
+        electrons, _ = steady
         noise = np.square(np.diff(electrons, axis=0)).mean(axis=0) / 2
-        light = electrons.mean(axis=0) + read
+        light = electrons.mean(axis=0) + camera.read_variance_e2((_SIDE * _ALONG, _SIDE * _ALONG))
         each, expected = (
-            image.reshape(shape[1:]).mean(axis=(1, 3)).ravel() for image in (noise, light)
+            image.reshape(_ALONG, _SIDE, _ALONG, _SIDE).mean(axis=(1, 3)).ravel()
+            for image in (noise, light)
         )
         ratio = each / expected
         return float(ratio.mean()), float(ratio.std(ddof=1) / math.sqrt(ratio.size))
@@ -100,7 +95,7 @@ class FieldSample:
             "of": math.prod(self.shape),
             "side_px": _SIDE,
             "corners_px": [list(corner) for corner in self.corners],
-            "seed": _SEED,
+            "seed": 1,
             "noise_ratio": ratio,
             "noise_ratio_se": error,
         }
@@ -134,7 +129,8 @@ class CutFrames:
             out = np.array(self._cut(placed.counts))
             placed.let_go()
             return out
-        step = max(1, _READ_BYTES // (math.prod(movie.shape[1:]) * movie.dtype.itemsize))
+        # some megabytes of whole frames are read at a time
+        step = max(1, 2**24 // (math.prod(movie.shape[1:]) * movie.dtype.itemsize))
         out = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
         for first in range(start, stop, step):
             end = min(first + step, stop)
@@ -153,4 +149,4 @@ def sampled(movie: CountSource, camera: Camera) -> tuple[CountSource, Camera]:
 
 def whole_frames(shape: tuple[int, ...], most: int, least: int = 16) -> int:
     """Say how many whole frames tell as much as so many of 256 × 256 pixels."""
-    return min(most, max(least, ALL_COUNTS * most // 128 // math.prod(shape)))
+    return min(most, max(least, 256**2 * most // math.prod(shape)))

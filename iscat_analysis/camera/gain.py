@@ -17,10 +17,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.errors import DataError
@@ -44,23 +45,17 @@ def shared_light(
     counts, shape = counts[:_FRAMES], counts.shape[1:]
     places = np.arange(math.prod(shape)) if masked is None else np.flatnonzero(~masked)
     places = places[:: max(1, -(-places.size // 4096))]  # some thousand pixels all over the field
-    offset, gain = (
-        np.broadcast_to(value, shape).flat[places]
-        for value in (camera.offset_adu, camera.gain_e_per_adu)
-    )
-    theirs = Camera(offset_adu=offset, gain_e_per_adu=gain)
-    pixels = theirs.to_electrons(counts.reshape(len(counts), -1)[:, places])
-    pixels = pixels[:, pixels.mean(axis=0) > 0]
-    if not pixels.size:
+    theirs = camera.mapped(lambda image: image.reshape(-1)[places])
+    values = counts.reshape(len(counts), -1)[:, places]
+    lit = theirs.to_electrons(values.mean(axis=0)) > 0
+    steady = theirs.mapped(lambda image: image[lit]).steady(values[:, lit]) if lit.any() else None
+    if steady is None:
         return None
-    power = pixels.mean(axis=1)
-    if power.min() <= 0:
-        return None
-    pixels *= (power.mean() / power)[:, None]
+    pixels, _ = steady
     light = pixels.mean(axis=0)
     near, apart, far = (
-        float(np.median(np.einsum("tp,tp->p", change, change) / len(change) / light))
-        for change in (pixels[lag:] - pixels[:-lag] for lag in (1, _APART, _FAR))
+        float(np.median(np.mean((pixels[lag:] - pixels[:-lag]) ** 2, axis=0) / light))
+        for lag in (1, _APART, _FAR)
     )
     if apart <= 0 or far <= 0:
         return None
@@ -77,11 +72,10 @@ def averaged_noise(counts: NDArray[Any], camera: Camera) -> float | None:
 
     Shapes: `counts` (t, y, x).
     """
-    if shared_light(counts, camera) is None:
+    steady = camera.steady(counts[:_FRAMES])
+    if steady is None or shared_light(counts, camera) is None:
         return None
-    pixels = camera.to_electrons(counts[:_FRAMES])
-    power = pixels.mean(axis=(1, 2), keepdims=True)
-    pixels *= power.mean() / power
+    pixels, _ = steady
     squares = [float(np.mean((pixels[k:] - pixels[:-k]) ** 2)) for k in (*range(1, _APART), _FAR)]
     common = sum(1 - one / squares[-1] for one in squares[:-1])
     return squares[-1] / squares[0] * (1 + 2 * common)
@@ -108,16 +102,15 @@ def measure_pattern_jitter(
     seen = _Pattern.of(counts, camera, masked)
     if seen is None:
         return None
-    light, used, information, variance = seen.light, seen.used, seen.information, seen.variance
-    steps = np.diff(light, axis=0)[:, used]
+    steps = np.diff(seen.light, axis=0)[:, seen.used] / seen.noise
     moved = seen.motion(steps)
-    explained = float(np.einsum("ki,ij,kj->", moved, information, moved)) - moved.size
-    beyond = float(np.sum(steps**2 / variance)) - steps.size
+    explained = float(np.sum((moved @ seen.slopes_in_noise) ** 2)) - moved.size
+    beyond = float(np.sum(steps**2)) - steps.size
     if beyond <= 0:
         return None
-    own = float(np.trace(np.linalg.inv(information))) / 2  # of the light's noise alone
-    rms = np.sqrt(max(float(np.mean(moved**2)) - own, 0.0) / 2)
-    return PatternJitter(explained / beyond, float(rms))
+    own = float(np.trace(seen.covariance)) / 2  # of the light's noise alone
+    rms = math.sqrt(max(float(np.mean(moved**2)) - own, 0.0) / 2)
+    return PatternJitter(explained / beyond, rms)
 
 
 def without_pattern_jitter(
@@ -130,22 +123,23 @@ def without_pattern_jitter(
     seen = _Pattern.of(counts, camera, masked)
     if seen is None:
         return counts
-    moved = seen.motion(seen.light[:, seen.used] - seen.mean[seen.used])
+    moved = seen.motion((seen.light - seen.mean)[:, seen.used] / seen.noise)
     change_e = np.einsum("ki,iyx->kyx", moved * seen.power[:, None], seen.slopes)
     return np.asarray(counts - change_e / camera.gain_e_per_adu)
 
 
 @dataclass(frozen=True)
 class _Pattern:
-    """Frames of equal power, their mean, and the Fisher information on its motion."""
+    """Frames of equal power, their mean, and how its motion stands out of the noise."""
 
     light: FloatArray  # (t, y, x) [e]
     power: FloatArray  # (t,), that was divided out
     mean: FloatArray
     slopes: FloatArray  # (2, y, x)
     used: BoolArray
-    variance: FloatArray  # of the difference of two frames, at the pixels used
-    information: FloatArray  # (2, 2)
+    noise: FloatArray  # of the difference of two frames, at the pixels used
+    slopes_in_noise: FloatArray  # (2, p)
+    covariance: FloatArray  # (2, 2) of the motion
 
     @classmethod
     def of(cls, counts: NDArray[Any], camera: Camera, masked: BoolArray | None) -> _Pattern | None:
@@ -160,18 +154,15 @@ class _Pattern:
         light /= power[:, None, None]
         mean = light.mean(axis=0)
         slopes = np.stack(np.gradient(mean))
-        variance = 2 * (mean + camera.read_variance_e2(mean.shape))[used]
-        there = slopes[:, used]
-        information = np.einsum("ip,jp,p->ij", there, there, 1 / variance)
-        if not np.linalg.cond(information) < 1 / np.finfo(float).eps:
+        noise = np.sqrt(2 * (mean + camera.read_variance_e2(mean.shape))[used])
+        seen = slopes[:, used] / noise
+        if not np.linalg.cond(seen @ seen.T) < 1 / np.finfo(float).eps:
             return None
-        return cls(light, power, mean, slopes, used, variance, information)
+        return cls(light, power, mean, slopes, used, noise, seen, np.linalg.inv(seen @ seen.T))
 
     def motion(self, changes: FloatArray) -> FloatArray:
-        """Fit the slopes to changes (k, p) in the used pixels: the motion along −y and −x."""
-        there = self.slopes[:, self.used]
-        seen = np.einsum("kp,ip,p->ki", changes, there, 1 / self.variance)
-        return np.asarray(np.linalg.solve(self.information, seen.T).T)
+        """Fit the slopes to changes (k, p) over their noise: the motion along −y and −x."""
+        return np.asarray(changes @ self.slopes_in_noise.T @ self.covariance)
 
 
 @dataclass(frozen=True)
@@ -208,10 +199,9 @@ class GainDiagnosis:
         """What the user should know where the gain is off."""
         if not self.off:
             return None
-        values: dict[str, float | str] = {
-            "ratio": self.noise_ratio, "ratio_se": self.noise_ratio_se,
-            "gain": self.configured_gain, "measured": self.gain_e_per_adu,
-        }  # fmt: skip
+        ratio, measured = self.noise_ratio, self.gain_e_per_adu
+        values: dict[str, float | str] = {"ratio": ratio, "ratio_se": self.noise_ratio_se}
+        values |= {"gain": self.configured_gain, "measured": measured}
         if self.noise_counts < 1:
             return NOISE_ROUNDED({**values, "noise_counts": self.noise_counts})
         if self.pattern_jitter is not None and self.shakes:
@@ -219,12 +209,12 @@ class GainDiagnosis:
             share = min(jitter.share, 1.0)
             return PATTERN_SHAKES({**values, "rms_px": jitter.rms_px, "share": share, "follow": ""})
         # Noise that grows with the light itself can only add, so only an excess has two causes.
-        unless = "unless the light itself is noisy, " if self.noise_ratio > 1 else ""
+        unless = "unless the light itself is noisy, " if ratio > 1 else ""
         return GAIN_OFF({**values, "unless": unless})
 
 
 def diagnose_gain(
-    counts: NDArray[Any], camera: Camera, *, masked: ArrayLike | None = None
+    counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None = None
 ) -> GainDiagnosis:
     r"""Measure the gain from the noise of frames in which nothing happens.
 
@@ -251,8 +241,27 @@ def diagnose_gain(
 
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """
-    used, excess, expected, shot = _excess_noise(counts, camera, masked)
     n_frames = len(counts)
+    if n_frames < 2:
+        raise DataError(
+            f"the gain needs two background frames or more to be measured, not {n_frames}"
+        )
+    used = camera.usable(counts, masked)
+    image = sum(map(camera.to_electrons, counts), np.zeros(used.shape)) / n_frames
+    used &= image > 0
+    if np.count_nonzero(used) < 2:
+        raise DataError("the gain cannot be measured: no pixel is lit and unsaturated throughout")
+    mean = image[used]
+    power = np.array([camera.to_electrons(frame)[used].mean() for frame in counts]) / mean.mean()
+    if power.min() <= 0:
+        raise DataError(
+            f"the gain cannot be measured: background frame {int(power.argmin())} is dark"
+        )
+    frames = (camera.to_electrons(f)[used] / p for f, p in zip(counts, power, strict=True))
+    squares = sum((np.square(after - before) for before, after in pairwise(frames)), 0 * mean)
+    shot, read = (float(np.sum(power[:-1] ** -n + power[1:] ** -n)) for n in (1, 2))
+    excess = squares - read * camera.dark_variance_e2(counts)[used]
+    expected = shot * (1 - float(np.sum(np.square(mean / mean.sum())))) * mean
     kept = _without_outliers(excess / expected, n_frames)
     excess, expected = excess[kept], expected[kept]
     ratio = float(excess.sum() / expected.sum())
@@ -262,10 +271,8 @@ def diagnose_gain(
             "alone; lower it"
         )
     ratio_se = float(np.sqrt(np.sum((excess - ratio * expected) ** 2)) / expected.sum())
-    gain = np.broadcast_to(camera.gain_e_per_adu, counts.shape[1:])[used][kept]
-    configured = float(gain.mean())
+    configured = float(np.broadcast_to(camera.gain_e_per_adu, used.shape)[used][kept].mean())
     whole = np.issubdtype(counts.dtype, np.integer)
-    per_count = np.sqrt(np.sum(excess) / (shot * len(excess))) / configured
     found = GainDiagnosis(
         noise_ratio=ratio,
         noise_ratio_se=ratio_se,
@@ -273,67 +280,12 @@ def diagnose_gain(
         gain_e_per_adu=configured / ratio,
         gain_se=configured * ratio_se / ratio**2,
         n_frames=n_frames,
-        n_pixels=int(np.count_nonzero(kept)),
-        noise_counts=float(per_count) if whole else math.inf,
+        n_pixels=len(excess),
+        noise_counts=math.sqrt(excess.mean() / shot) / configured if whole else math.inf,
     )
-    return with_pattern_jitter(found, counts, camera, masked=~used)
-
-
-def _excess_noise(
-    counts: NDArray[Any], camera: Camera, masked: ArrayLike | None
-) -> tuple[BoolArray, FloatArray, FloatArray, float]:
-    """Sum the terms a_p and b_p of `diagnose_gain` over pairs of frames.
-
-    Returns the pixels that are used (y, x), both sums in these (n,), and the weight of shot noise.
-    """
-    n_frames = len(counts)
-    if n_frames < 2:
-        raise DataError(
-            f"the gain needs two background frames or more to be measured, not {n_frames}"
-        )
-    used = np.ones(counts.shape[1:], dtype=np.bool_)
-    if masked is not None:
-        used &= ~np.asarray(masked, dtype=np.bool_)
-    for frame in counts:
-        used &= ~camera.saturated(frame)
-    total = np.zeros(counts.shape[1:])
-    for frame in counts:
-        total += camera.to_electrons(frame)
-    used &= total > 0
-    if np.count_nonzero(used) < 2:
-        raise DataError("the gain cannot be measured: no pixel is lit and unsaturated throughout")
-
-    power = np.array([camera.to_electrons(frame)[used].sum() for frame in counts])
-    if power.min() <= 0:
-        raise DataError(
-            f"the gain cannot be measured: background frame {int(power.argmin())} is dark"
-        )
-    power /= power.mean()
-    mean = total[used] / n_frames
-    share = mean / mean.sum()
-    squares = np.zeros(mean.shape)
-    before = camera.to_electrons(counts[0])[used] / power[0]
-    for number in range(1, n_frames):
-        after = camera.to_electrons(counts[number])[used] / power[number]
-        squares += np.square(after - before)
-        before = after
-    shot = float(np.sum(1 / power[:-1] + 1 / power[1:]))
-    read = float(np.sum(1 / power[:-1] ** 2 + 1 / power[1:] ** 2))
-    excess = squares - read * camera.dark_variance_e2(counts)[used]
-    expected = shot * (1 - float(np.sum(share**2))) * mean
-    return used, excess, expected, shot
-
-
-def with_pattern_jitter(
-    found: GainDiagnosis, counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None
-) -> GainDiagnosis:
-    """Measure how much of an excess of noise the motion of the fixed pattern explains.
-
-    Shapes: `counts` (t, y, x), `masked` (y, x).
-    """
-    if not found.off or found.noise_ratio < 1 or found.pattern_jitter is not None:
+    if not found.off or ratio < 1:
         return found
-    return replace(found, pattern_jitter=measure_pattern_jitter(counts, camera, masked=masked))
+    return replace(found, pattern_jitter=measure_pattern_jitter(counts, camera, masked=~used))
 
 
 def _without_outliers(ratios: FloatArray, n_frames: int) -> BoolArray:

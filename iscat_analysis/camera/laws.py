@@ -136,8 +136,8 @@ def _saturation(u: FloatArray, x: float) -> Curves:
     return n * np.exp(-2 * n), n * np.exp(-n)
 
 
+_OFFSET = _Family("offset", lambda u, s: (u - s, u - s), lambda s: 1 - s, 0.0, (-3.0, 0.95))
 _FAMILIES = (
-    _Family("offset", lambda u, s: (u - s, u - s), lambda s: 1 - s, 0.0, (-3.0, 0.95)),
     _Family("read noise", lambda u, r: (u + r, u), lambda _: 1.0, 0.01, (0.0, 3.0)),
     _Family("gamma", lambda u, g: (np.power(u, 2 - 1 / g), u), lambda g: g, 0.9, (0.3, 1.0)),
     _Family("saturation", _saturation, lambda x: x / math.expm1(x), 0.1, (1e-4, 4.0)),
@@ -153,34 +153,25 @@ def find_law(found: Transfer, *, most_read: float = 0.0, least_offset: float = -
     have without anybody saying so.  `least_offset` is how much too high the offset may be, as a
     share of the light below zero: no camera has an offset below no counts.
     """
+    flickers = found.flicker is not None
     u = found.light / found.level
-    flat = np.zeros(0)
     linear = float(np.sum(_residuals(found, (u, u)) ** 2))
-    laws = []
-    for family in _FAMILIES:
-        if family.kind == "other light" and found.flicker is None:
-            continue
-        if family.kind == "offset":
-            family = replace(family, ends=(min(least_offset, -1e-6), family.ends[1]))
-        law = _fitted(found, u, family, flat)
-        if family.kind == "read noise" and law.value - 2 * law.se > most_read:
-            continue
-        laws.append(law)
-    best = min(laws, key=lambda law: law.chi2 + _RARE.get(law.kind, 0.0))
-    pairs = [
-        _fitted(found, u, family, np.zeros(1))
-        for family in _FAMILIES
-        if found.flicker is not None and family.kind in BENT
-    ]
-    both = min(pairs, key=lambda law: law.chi2, default=best)
-    if best.chi2 - both.chi2 > 20.0:  # with one number more
-        return both
+    offset = replace(_OFFSET, ends=(min(least_offset, -1e-6), _OFFSET.ends[1]))
+    families = [k for k in (offset, *_FAMILIES) if flickers or k.kind != "other light"]
+    laws = {family.kind: _fitted(found, family) for family in families}
+    read = laws["read noise"]
+    if read.value - 2 * read.se > most_read:
+        del laws["read noise"]
+    best = min(laws.values(), key=lambda law: law.chi2 + _RARE.get(law.kind, 0.0))
+    if flickers:
+        pairs = [_fitted(found, family, shifted=True) for family in families if family.kind in BENT]
+        both = min(pairs, key=lambda law: law.chi2)
+        if best.chi2 - both.chi2 > 20.0:  # with one number more
+            return both
     if linear - best.chi2 < 16.0:  # a line is as good
-        zero = next(law for law in laws if law.kind == "offset")
-        se = math.hypot(zero.value, zero.se)  # of zero, which is kept
-        flickers = found.flicker is not None
+        se = math.hypot(laws["offset"].value, laws["offset"].se)  # of zero, which is kept
         return Law("linear", 0.0, se, 1.0, se, chi2=linear, flickers=flickers)
-    return _among(best, [law for law in laws if law.chi2 - best.chi2 < 6.0])  # as good
+    return _among(best, [law for law in laws.values() if law.chi2 - best.chi2 < 6.0])  # as good
 
 
 def _among(best: Law, alike: list[Law]) -> Law:
@@ -197,39 +188,36 @@ def _among(best: Law, alike: list[Law]) -> Law:
 
 def _residuals(found: Transfer, curves: Curves) -> FloatArray:
     """Residuals of the best multiples of two curves, in standard errors."""
+    seen = [(found.variance, found.variance_se), (found.slope, found.slope_se)]
     rest = []
-    for seen, se, curve in (
-        (found.variance, found.variance_se, curves[0]),
-        (found.slope, found.slope_se, curves[1]),
-    )[: 1 if found.flicker is None else 2]:
-        model = curve / se
-        rest.append(seen / se - model * float(model @ (seen / se)) / float(model @ model))
+    for (values, se), curve in zip(seen if found.flicker else seen[:1], curves, strict=False):
+        model, values = curve / se, values / se
+        rest.append(values - model * float(model @ values) / float(model @ model))
     return np.concatenate(rest)
 
 
-def _fitted(found: Transfer, u: FloatArray, family: _Family, offset: FloatArray) -> Law:
-    """Fit the number of a law and, if `offset` has an entry, the share that is no light."""
+def _fitted(found: Transfer, family: _Family, *, shifted: bool = False) -> Law:
+    """Fit the number of a law and, where it is `shifted`, the share that is no light."""
+    numbers = 2 if shifted else 1
 
     def residuals(theta: FloatArray) -> FloatArray:
-        shift = float(theta[1]) if offset.size else 0.0
-        above = np.maximum(u - shift, 1e-3) / (1 - shift)
-        return _residuals(found, family.curves(above, float(theta[0])))
+        value, shift = (*theta.tolist(), 0.0)[:2]
+        above = np.maximum(found.light / found.level - shift, 1e-3) / (1 - shift)
+        return _residuals(found, family.curves(above, value))
 
-    low, high = family.ends
-    ends = np.array([[low, *(-3.0 + 0 * offset)], [high, *(0.9 + 0 * offset)]])
-    start = np.clip([family.start, *offset], *ends)
+    ends = np.array([family.ends, (-3.0, 0.9)])[:numbers].T
+    start = np.clip([family.start, 0.0][:numbers], *ends)
     best = scipy.optimize.least_squares(residuals, start, bounds=ends, xtol=1e-10, x_scale="jac")
-    theta, covariance = best.x, np.linalg.pinv(best.jac.T @ best.jac)
-    value, se = float(theta[0]), math.sqrt(float(covariance[0, 0]))
-    shift = float(theta[1]) if offset.size else 0.0
-    step = 1e-4
-    slope = (family.contrast(value + step) - family.contrast(value)) / step
-    gradient = np.array([slope * (1 - shift), *(-family.contrast(value) + 0 * offset)])
+    value, shift = (*best.x.tolist(), 0.0)[:2]
+    covariance = np.linalg.pinv(best.jac.T @ best.jac)
+    contrast, step = family.contrast(value), 1e-4
+    slope = (family.contrast(value + step) - contrast) / step
+    gradient = np.array([slope * (1 - shift), -contrast])[:numbers]
     return Law(
         kind=family.kind,
         value=value,
-        se=se,
-        contrast=family.contrast(value) * (1 - shift),
+        se=math.sqrt(float(covariance[0, 0])),
+        contrast=contrast * (1 - shift),
         contrast_se=math.sqrt(max(float(gradient @ covariance @ gradient), 0.0)),
         offset=shift,
         chi2=2 * float(best.cost),
@@ -256,12 +244,9 @@ class Response:
     def of(self, counts: NDArray[Any]) -> FloatArray:
         """Convert counts; below the first point with the slope there, because of noise."""
         seen = np.asarray(counts, dtype=np.float64)
+        slope = np.diff(self.photoelectrons[:2]) / np.diff(self.counts[:2])
         out: FloatArray = np.interp(seen, self.counts, self.photoelectrons)
-        below = np.minimum(seen - self.counts[0], 0.0)
-        slope = (self.photoelectrons[1] - self.photoelectrons[0]) / (
-            self.counts[1] - self.counts[0]
-        )
-        out += below * slope
+        out += np.minimum(seen - self.counts[0], 0.0) * slope
         return out
 
     @property

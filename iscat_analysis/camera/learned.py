@@ -12,11 +12,12 @@ on the configuration has numbers, whatever they come from.
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,35 +28,25 @@ from iscat_analysis.camera.counts import (
     padded_bits,
     rounding_variance_adu2,
 )
-from iscat_analysis.camera.gain import (
-    GainDiagnosis,
-    averaged_noise,
-    diagnose_gain,
-    without_pattern_jitter,
-)
+from iscat_analysis.camera.gain import averaged_noise, diagnose_gain, without_pattern_jitter
 from iscat_analysis.camera.laws import Law, Response, find_law, full_scale, linear, response_of
-from iscat_analysis.camera.pixels import find_text, patched, without_text
+from iscat_analysis.camera.pixels import find_text, without_text
 from iscat_analysis.camera.spectrum import measure_spectrum
 from iscat_analysis.camera.transfer import TOLD, Transfer, judge_zero, measure_transfer
 from iscat_analysis.config import ASSUMED, AUTO, CameraConfig, Config, Optics, plausible_pixel
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.findings import Finding, existing
+from iscat_analysis.findings import files as of_files
 from iscat_analysis.findings.camera import GAIN_ASSUMED, OFFSET_FROM_NOISE
-from iscat_analysis.findings.files import (
-    BITS_PADDED,
-    COARSE_PIXELS,
-    DISPLAYED_RATE,
-    FRAMES_DROPPED,
-    METADATA_DISAGREES,
-    OPTICS_OF_FILE,
-)
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import BoolArray, CountSource, StackMetadata
 from iscat_analysis.units import count
 
+S = TypeVar("S", CameraConfig, Optics)
+
 _MOST_FRAMES, _MOST_COUNTS = 1024, 2**23  # that are looked at: it takes a second
 _LEAST_FRAMES = 8
-_FIRST_FRAMES = 64  # frames among which some may be dark
+_FIRST_FRAMES = 64  # that may be dark, and that tell of noise and motion
 _DARK_LIGHT_SHARE = 0.5  # of the usual counts, below which a frame may be without light
 # of what the counts of dark frames would show, if they were light: its error, and itself
 _LIT_SHARE_ERROR, _LIT_SHARE = 0.1, 0.1
@@ -68,16 +59,18 @@ def sample(
 
     Shapes: `lit` (t, y, x), `dark` (k, y, x).
     """
-    total = movie.shape[0]
+
+    def levels(numbers: Iterable[int]) -> dict[int, float]:
+        frames = ((k, _finite(movie.read(k, k + 1))) for k in numbers)
+        return {k: float(frame.mean()) for k, frame in frames if len(frame)}
+
     # frames all over the movie, by which the usual light is known
-    looks = np.unique(np.linspace(span[0], span[1] - 1, 24).astype(int)).tolist()
-    levels = [float(frame.mean()) for k in looks for frame in _finite(movie.read(k, k + 1))]
-    first = min(_FIRST_FRAMES, total)
-    looked = [(k, float(one.mean())) for k in range(first) for one in _finite(movie.read(k, k + 1))]
-    if not levels or not looked:
+    every = levels(np.unique(np.linspace(span[0], span[1] - 1, 24).astype(int)).tolist())
+    first = levels(range(min(_FIRST_FRAMES, movie.shape[0])))
+    if not every or not first:
         return movie.read(0, 0), None
-    usual = float(np.quantile(levels, 0.75))
-    means = np.array([mean for _, mean in looked])
+    usual = float(np.quantile([*every.values()], 0.75))
+    means = np.array([*first.values()])
     dim = (means < _DARK_LIGHT_SHARE * usual) & (means > 0)
     dim &= means - means.min() < 0.01 * usual  # and no shutter that is opening
     most = max(_LEAST_FRAMES, min(_MOST_FRAMES, _MOST_COUNTS // pixels))
@@ -87,9 +80,7 @@ def sample(
     counts = counts[lit & ~repeats]
     if not dim.any() or dim.all() or len(counts) < _LEAST_FRAMES:
         return counts, None
-    dark = np.concatenate(
-        [movie.read(k, k + 1) for (k, _), d in zip(looked, dim, strict=True) if d]
-    )
+    dark = np.concatenate([movie.read(k, k + 1) for k in np.array([*first])[dim].tolist()])
     return counts, dark if _is_dark(dark, counts) else None
 
 
@@ -131,12 +122,8 @@ MEASURED, DARK, CONFIGURED, METADATA = "measured", "dark frames", "configured", 
 EFFECTIVE, ASSUMPTION, ROUNDING = "effective", "assumed", "rounding"
 """Where a number comes from."""
 
-_GAIN_FRAMES = 128  # on which the gain is measured, to some parts in a thousand
-_FIRST_FRAMES = 64  # frames that motion of the pattern is taken from
 _READ_E, _READ_STEPS = 30.0, 3.0  # read noise that a camera may have without anybody saying so [e]
-_TURNS = 3
 _WORD = 16  # bits of most files
-_FOURTH = 70.0  # sum of the squares of 1, −4, 6, −4, 1: the norm of both axes together
 
 
 @dataclass(frozen=True)
@@ -166,22 +153,20 @@ class LearnedCamera:
         """Tell that the camera's bits are not the lowest."""
         if not self.padded:
             return None
-        return BITS_PADDED({"step": 2**self.padded, "bits": _WORD - self.padded}, where=name)
+        return of_files.BITS_PADDED(
+            {"step": 2**self.padded, "bits": _WORD - self.padded}, where=name
+        )
 
     @property
     def description(self) -> str:
         """Describe the numbers and their sources in one line."""
         parts = []
-        for key, words in (
-            ("gain_e_per_adu", "{} e per count"),
-            ("offset_adu", "offset {} counts"),
-            ("read_noise_e", "read noise {} e"),
-        ):
-            number = self.numbers[key]
+        words = "{} e per count", "offset {} counts", "read noise {} e"
+        for text, number in zip(words, (self.numbers[key] for key in ASSUMED), strict=True):
             shown = f"{number.value:.4g}"
             if number.se > 0 and number.source != CONFIGURED:
                 shown += f" ± {number.se:.2g}"
-            parts.append(f"{words.format(shown)} ({number.source})")
+            parts.append(f"{text.format(shown)} ({number.source})")
         return "camera: " + ", ".join(parts)
 
     @property
@@ -195,15 +180,8 @@ class LearnedCamera:
             found["light_adu"] = self.level_e / float(np.mean(self.camera.gain_e_per_adu))
         law = self.camera.law
         if law is not None:
-            found["law"] = {
-                "kind": law.kind,
-                "value": law.value,
-                "se": law.se,
-                "contrast": law.contrast,
-                "contrast_se": law.contrast_se,
-                "alike": list(law.alike),
-                "flickers": law.flickers,
-            }
+            shown = ("kind", "value", "se", "contrast", "contrast_se", "flickers")
+            found["law"] = {key: getattr(law, key) for key in shown} | {"alike": [*law.alike]}
         return found
 
 
@@ -216,18 +194,18 @@ def with_camera(
     optics, pixel_nm = config.optics, config.camera.pixel_size_nm or math.inf
     resolved = pixel_nm < 0.4 * optics.wavelength_nm / optics.na  # finer than any detail of light
     learned = learn_camera(
-        movie if text is None else patched(movie, text),
+        movie,
         config.camera,
         span,
         additive=not optics.interferes,
         moving=config.fit.follows_tracks and resolved,
         metadata=movie.metadata,
+        text=text,
     )
     if learned.refusal:
         raise DataError(f"{movie.name}: {learned.refusal}")
     if text is not None:
         movie = without_text(movie, text, learned.camera)
-        learned = replace(learned, text=text)
     return movie, config.model_copy(update={"camera": learned.config}), learned
 
 
@@ -239,11 +217,13 @@ def learn_camera(
     additive: bool = False,
     moving: bool = False,
     metadata: StackMetadata | None = None,
+    text: BoolArray | None = None,
 ) -> LearnedCamera:
     """Learn the numbers of the camera from a movie.
 
     `additive` where there is no reference; `moving` where particles move in all frames.  Gain and
-    offset of the file's metadata stand where they cannot be measured.
+    offset of the file's metadata stand where they cannot be measured.  Rows with a burnt-in `text`
+    tell nothing.
     """
     shape = (movie.shape[1], movie.shape[2])
     camera = camera_from_config(config, shape, movie.dtype)
@@ -251,22 +231,27 @@ def learn_camera(
         camera = replace(camera, full_scale_adu=full_scale(config, movie.dtype))
     free = {key for key in ASSUMED if getattr(config, key) == AUTO}
     counts, dark = sample(movie, span, math.prod(shape))
-    found = _Learning(camera, free, counts, additive, moving)
+    rows = np.flatnonzero(np.ones(shape[0]) if text is None else ~text.any(axis=1))
+    seen = camera.part((rows,)) if text is not None else camera
+    counts, dark = counts[:, rows], None if dark is None else dark[:, rows]
+    found = _Learning(seen, free, counts, additive, moving)
     if metadata is not None and config.response is None:
         found.take_metadata(metadata)
     if dark is not None:
         found.take_dark(dark)
     found.learn()
     numbers = {key: found.number(key) for key in ASSUMED}
-    changed = {key: numbers[key].value for key in ASSUMED if key in found.changed}
+    as_before = (ASSUMPTION, CONFIGURED)
+    changed = {key: each.value for key, each in numbers.items() if each.source not in as_before}
     return LearnedCamera(
         config=config.assumed.model_copy(update=changed),
-        camera=replace(found.camera, law=found.law),
+        camera=replace(camera, law=found.law, **changed),
         numbers=numbers,
         findings=tuple(found.findings),
         level_e=found.level_e,
         refusal=found.refusal,
         response=found.response(),
+        text=text,
         padded=padded_bits(counts) if counts.dtype.itemsize * 8 == _WORD else 0,
     )
 
@@ -279,7 +264,6 @@ class _Learning:
     ) -> None:
         self.camera, self.free, self.counts = camera, free, counts
         self.additive, self.moving = additive, moving
-        self.changed: set[str] = set()
         self.law: Law | None = None
         self.transfer: Transfer | None = None
         self.findings: list[Finding] = []
@@ -287,6 +271,11 @@ class _Learning:
         self._se = dict.fromkeys(ASSUMED, 0.0)
         self._source = {key: ASSUMPTION if key in free else CONFIGURED for key in ASSUMED}
         self._dark_variance: float | None = None
+
+    @property
+    def gain(self) -> float:
+        """Photoelectrons per count, on average."""
+        return float(np.mean(self.camera.gain_e_per_adu))
 
     def number(self, key: str) -> Number:
         """Value of a number; of a map, its mean."""
@@ -298,8 +287,9 @@ class _Learning:
         law, found = self.law, self.transfer
         if law is None or found is None or not law.bent or not law.certain:
             return None
-        top = self.camera.full_scale_adu or float(self.counts.max())
-        return response_of(law, found, self.camera, max(top, float(self.counts.max())))
+        highest = float(self.counts.max())
+        top = max(self.camera.full_scale_adu or highest, highest)
+        return response_of(law, found, self.camera, top)
 
     def take_metadata(self, metadata: StackMetadata) -> None:
         """Take the numbers that the driver of the camera wrote into the file."""
@@ -328,20 +318,16 @@ class _Learning:
         """Measure what is not configured, on frames with light."""
         if len(self.counts) < 2:
             self._cannot("it has no two frames with light")
-            return
-        if not self.additive and not self._learn_gain():
-            return
-        if self.additive:
+        elif self.additive:
             self._learn_slope()
-            return
-        self._learn_law()
-        self._mind_rounding()
-        self._mind_zero()
+        elif self._learn_gain():
+            self._learn_law()
+            self._mind_rounding()
+            self._mind_zero()
 
     def _set(self, key: str, value: float, se: float, source: str) -> None:
         self.camera = replace(self.camera, **{key: value})  # type: ignore[arg-type]
         self._se[key], self._source[key] = se, source
-        self.changed.add(key)
 
     def _cannot(self, why: str) -> None:
         """Say once that the gain keeps its default."""
@@ -353,51 +339,47 @@ class _Learning:
         quiet = self._dark_variance is None and not np.any(self.camera.read_noise_e)
         # rounding has no part in the gain
         fine = noise_adu2(self.counts) > 1e4 * rounding_variance_adu2(self.counts)
-        for _ in range(1 if quiet and fine else _TURNS):  # what is no light depends on the gain
+        for _ in range(1 if quiet and fine else 3):  # what is no light depends on the gain
             if self._dark_variance is not None:
-                gain = float(np.mean(self.camera.gain_e_per_adu))
-                read = gain * math.sqrt(self._dark_variance)
-                self._set("read_noise_e", read, 0.0, DARK)
+                self._set("read_noise_e", self.gain * math.sqrt(self._dark_variance), 0.0, DARK)
             if "gain_e_per_adu" not in self.free:
                 return True
             try:
                 gain, error, source = self._gain()
-            except DataError as error_:
-                self._cannot(str(error_))
+            except DataError as why:
+                self._cannot(str(why))
                 return False
             self._set("gain_e_per_adu", gain, error, source)
         return True
 
     def _gain(self) -> tuple[float, float, str]:
         """Measure the gain by the noise between neighbouring frames, or by that of averages."""
-        camera, counts = self.camera, self.counts[:_GAIN_FRAMES]
-        step2 = 12 * rounding_variance_adu2(counts)
-        if step2 and 0 < noise_adu2(counts) < 0.16 * step2:  # less is lost in rounding
+        camera, counts = self.camera, self.counts[:128]  # to some parts in a thousand
+        noise, step2 = noise_adu2(counts), 12 * rounding_variance_adu2(counts)
+        if step2 and 0 < noise < 0.16 * step2:  # less is lost in rounding
             as_stored = counts.astype(np.float64)  # of which nothing is taken off for rounding
             found = diagnose_gain(as_stored, replace(camera, read_noise_e=0.0))
             return found.gain_e_per_adu, found.gain_se, EFFECTIVE
         if self.moving:
             return *_gain_of_detail(counts, camera), MEASURED
         found = diagnose_gain(counts, camera)
-        seen = replace(camera, gain_e_per_adu=found.gain_e_per_adu)
+        gain, gain_se = found.gain_e_per_adu, found.gain_se
+        seen = replace(camera, gain_e_per_adu=gain)
         longer = averaged_noise(counts, seen)
         if longer is not None:
-            return found.gain_e_per_adu / longer, found.gain_se / longer, EFFECTIVE
-        still = without_pattern_jitter(counts[:_FIRST_FRAMES], seen)
-        calm, rough = (
-            _short(part, seen) for part in (still, counts[:_FIRST_FRAMES].astype(np.float64))
-        )
-        if calm is not None and rough is not None:
-            ratio = calm.noise_ratio / rough.noise_ratio
+            return gain / longer, gain_se / longer, EFFECTIVE
+        few = counts[:_FIRST_FRAMES].astype(np.float64)
+        with contextlib.suppress(DataError):
+            calm = diagnose_gain(without_pattern_jitter(few, seen), seen)
+            ratio = calm.noise_ratio / diagnose_gain(few, seen).noise_ratio
             # motion made that share of the noise at least
             if ratio < 1 - 0.03 - 3 * calm.noise_ratio_se:
-                return found.gain_e_per_adu / ratio, found.gain_se / ratio, MEASURED
+                return gain / ratio, gain_se / ratio, MEASURED
         spectrum = measure_spectrum(counts, seen)
         if spectrum is not None and spectrum.correlated:
             ratio, se = spectrum.summed
-            gain = found.gain_e_per_adu / ratio
-            return gain, math.hypot(found.gain_se / ratio, gain * se / ratio), MEASURED
-        return found.gain_e_per_adu, found.gain_se, MEASURED
+            return gain / ratio, math.hypot(gain_se, gain * se / ratio) / ratio, MEASURED
+        return gain, gain_se, MEASURED
 
     def _learn_slope(self) -> None:
         """Measure gain against light, where most of the counts are offset."""
@@ -407,10 +389,9 @@ class _Learning:
         if found is None or found.noise is None:
             self._cannot("its pixels are too alike, or too dark")
             return
-        light, variance = found.light, found.variance
-        slope, _ = np.polyfit(light, variance, 1, w=1 / found.variance_se)
+        slope, _ = np.polyfit(found.light, found.variance, 1, w=1 / found.variance_se)
         if slope > 0:
-            gain = float(np.mean(self.camera.gain_e_per_adu)) / float(slope)
+            gain = self.gain / float(slope)
             self._set("gain_e_per_adu", gain, gain * found.noise.se / found.level, MEASURED)
 
     def _learn_law(self) -> None:
@@ -419,31 +400,32 @@ class _Learning:
         if found is None:
             return
         self.level_e = found.level
-        gain = float(np.mean(self.camera.gain_e_per_adu))
-        plausible = self._most_read_e2 / found.level
+        level_adu = found.level / self.gain
         dark = self._source["offset_adu"] in (DARK, METADATA)
-        lowest = -float(np.mean(self.camera.offset_adu)) * gain / found.level
-        self.law = law = find_law(found, most_read=plausible, least_offset=lowest)
-        error = law.se * found.level / gain
-        if "offset_adu" in self.free and not dark:
+        lowest = -float(np.mean(self.camera.offset_adu)) / level_adu
+        most_read = self._most_read_e2 / found.level
+        self.law = law = find_law(found, most_read=most_read, least_offset=lowest)
+        if dark:
+            return
+        if "offset_adu" in self.free:
             if law.kind == "offset" and abs(law.value) > 4 * law.se:
-                self._take_offset(law, found.level / gain, error)
+                self._take_offset(law, level_adu)
             elif law.kind == "linear":
-                self._se["offset_adu"] = error  # of the assumption
-        if law.kind == "read noise" and "read_noise_e" in self.free and not dark:
+                self._se["offset_adu"] = law.se * level_adu  # of the assumption
+        if law.kind == "read noise" and "read_noise_e" in self.free:
             share, level = law.value, found.level
             if "gain_e_per_adu" in self.free:
-                self._set(
-                    "gain_e_per_adu", gain * (1 + share), self._se["gain_e_per_adu"], MEASURED
-                )
+                gain, se = self.gain * (1 + share), self._se["gain_e_per_adu"]
+                self._set("gain_e_per_adu", gain, se, MEASURED)
                 level *= 1 + share
             read = math.sqrt(share * level)
             self._set("read_noise_e", read, read * law.se / (2 * share), MEASURED)
             self.law = None
 
-    def _take_offset(self, law: Law, level_adu: float, error: float) -> None:
+    def _take_offset(self, law: Law, level_adu: float) -> None:
         """Take the offset from the zero of the light, and measure the rest again."""
         offset = float(np.mean(self.camera.offset_adu)) + law.value * level_adu
+        error = law.se * level_adu
         self._set("offset_adu", offset, error, MEASURED)
         self.free.discard("offset_adu")
         if not law.flickers:
@@ -455,19 +437,16 @@ class _Learning:
     def _most_read_e2(self) -> float:
         """Variance of the read noise that a camera may have without anybody saying so."""
         steps = math.sqrt(12 * rounding_variance_adu2(self.counts))
-        gain = float(np.mean(self.camera.gain_e_per_adu))
-        return max(_READ_E, _READ_STEPS * steps * gain) ** 2
+        return max(_READ_E, _READ_STEPS * steps * self.gain) ** 2
 
     def _mind_zero(self) -> None:
         """Refuse counts without a true zero, where neither offset nor gain is known otherwise."""
-        if self._source["offset_adu"] != ASSUMPTION or self._source["gain_e_per_adu"] not in (
-            MEASURED,
-            EFFECTIVE,
-        ):
+        measured = self._source["gain_e_per_adu"] in (MEASURED, EFFECTIVE)
+        if self._source["offset_adu"] != ASSUMPTION or not measured:
             return
         law = self.law
         if law is not None and law.below_nothing:
-            level = self.level_e / float(np.mean(self.camera.gain_e_per_adu))
+            level = self.level_e / self.gain
             counts, error = law.offset * level, law.contrast_se * level
             self.refusal = (
                 "counts were subtracted from it: noise and flicker of the pixels show the zero of "
@@ -491,13 +470,11 @@ class _Learning:
         elif zero is not None and zero.error is not None:
             told = law.se if law is not None else math.inf
             self.level_e = zero.level_e
-            gain = float(np.mean(self.camera.gain_e_per_adu))
-            self._se["offset_adu"] = min(told, zero.error) * zero.level_e / gain
+            self._se["offset_adu"] = min(told, zero.error) * zero.level_e / self.gain
 
     def _mind_rounding(self) -> None:
         """Count rounding as read noise, unless it is far below the noise of the light."""
-        gain = float(np.mean(self.camera.gain_e_per_adu))
-        rounding = rounding_variance_adu2(self.counts) * gain**2 - 1 / 12
+        rounding = rounding_variance_adu2(self.counts) * self.gain**2 - 1 / 12
         light = float(np.median(self.camera.to_electrons(self.counts.mean(axis=0))))
         read = float(np.mean(np.square(self.camera.read_noise_e)))
         if self._source["gain_e_per_adu"] != EFFECTIVE and rounding > max(read, 1e-3 * light):
@@ -513,13 +490,13 @@ def _gain_of_detail(counts: NDArray[Any], camera: Camera) -> tuple[float, float]
 
     Shapes: `counts` (t, y, x).
     """
-    light = camera.to_electrons(counts)
-    power = light.mean(axis=(1, 2), keepdims=True)
-    if power.min() <= 0:
+    steady = camera.steady(counts)
+    if steady is None:
         raise DataError("a frame is dark")
-    light *= power.mean() / power
+    light, _ = steady
     mean, dark = light.mean(axis=0), camera.dark_variance_e2(counts)
-    scale = _FOURTH * np.sqrt(2 * np.maximum(mean + dark, 1.0))
+    # 70: the sum of the squares of 1, −4, 6, −4, 1, the norm of both axes together
+    scale = 70.0 * np.sqrt(2 * np.maximum(mean + dark, 1.0))
     squares = [
         np.mean(np.diff(np.diff((after - before) / scale, 4, axis=0), 4, axis=1) ** 2)
         for before, after in pairwise(light)
@@ -533,75 +510,65 @@ def _gain_of_detail(counts: NDArray[Any], camera: Camera) -> tuple[float, float]
     return gain / ratio, gain * error / ratio**2
 
 
-def _short(counts: NDArray[Any], camera: Camera) -> GainDiagnosis | None:
-    try:
-        return diagnose_gain(counts, camera)
-    except DataError:
-        return None
-
-
 def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, list[Finding]]:
     """Set what the configuration leaves open from the metadata of the movie."""
-    notes = []
-    found: dict[str, float] = {}
-    source = {"source": metadata.source}
-    for key, unit, words in (
-        ("pixel_size_nm", " nm", "pixel size"),
-        ("exposure_ms", " ms", "exposure"),
-        ("frame_rate_hz", " Hz", "frame rate"),
-    ):
-        given: float | None = getattr(config.camera, key)
-        read: float | None = getattr(metadata, key)
-        if read is None:
-            continue
-        if given is None:
-            if key == "pixel_size_nm":
-                _refuse_unlikely(read, metadata.source)
-            found[key] = read
-        elif abs(read / given - 1) > 0.01:  # rounding aside
-            values: dict[str, float | str] = {"words": words, "given": given, "read": read}
-            notes.append(
-                METADATA_DISAGREES({**values, **source, "unit": unit, "key": f"camera.{key}"})
-            )
+    camera, notes = _of_file(config.camera, metadata, _CAMERA_KEYS)
     shown_hz = metadata.displayed_hz
     if config.fit.follows_tracks and shown_hz is not None and metadata.frame_rate_hz is None:
-        notes.append(DISPLAYED_RATE({"shown_hz": shown_hz}))
+        notes.append(of_files.DISPLAYED_RATE({"shown_hz": shown_hz}))
     if metadata.ticks is not None:
         missing = metadata.ticks[-1] + 1 - len(metadata.ticks)
-        notes.append(FRAMES_DROPPED({"frames": count(missing, "frame"), **source}))
-    if config.camera.pixel_size_nm is None and "pixel_size_nm" not in found:
+        dropped = {"frames": count(missing, "frame"), "source": metadata.source}
+        notes.append(of_files.FRAMES_DROPPED(dropped))
+    if camera.pixel_size_nm is None:
         raise DataError(
             "the pixel size is neither in the configuration nor in the movie's metadata; "
             "set camera.pixel_size_nm, as in camera.pixel_size_nm = 84.4"
         )
-    camera = config.camera.model_copy(update=found)
-    optics, taken_from_file = _with_optics(config.optics, metadata)
+    optics, taken_from_file = _of_file(config.optics, metadata, _OPTICS_KEYS)
+    of_file = config.camera.pixel_size_nm is None
+    where = f"in the movie's {metadata.source} metadata" if of_file else "in the configuration"
     config = config.model_copy(update={"camera": camera, "optics": optics})
-    where = f"in the movie's {metadata.source} metadata" if "pixel_size_nm" in found else ""
-    coarse = _coarse_pixels(config, where or "in the configuration")
-    return config, existing([*notes, *taken_from_file, coarse])
+    return config, existing([*notes, *taken_from_file, _coarse_pixels(config, where)])
 
 
-def _with_optics(optics: Optics, metadata: StackMetadata) -> tuple[Optics, list[Finding]]:
-    """Replace defaults of the optics by the metadata of the movie."""
+_CAMERA_KEYS = {
+    "pixel_size_nm": ("pixel size", " nm"),
+    "exposure_ms": ("exposure", " ms"),
+    "frame_rate_hz": ("frame rate", " Hz"),
+}
+_OPTICS_KEYS = {"wavelength_nm": ("wavelength", " nm"), "na": ("NA", "")}
+"""Keys that a file may tell: words for them, and how their unit is written."""
+
+
+def _of_file(
+    section: S, metadata: StackMetadata, keys: Mapping[str, tuple[str, str]]
+) -> tuple[S, list[Finding]]:
+    """Replace defaults of a section by the metadata of the movie, and say what disagrees."""
     found: dict[str, float] = {}
-    notes = []
-    for key, unit, words in (("wavelength_nm", " nm", "wavelength"), ("na", "", "NA")):
-        given: float = getattr(optics, key)
+    notes: list[Finding] = []
+    optics = isinstance(section, Optics)
+    for key, (words, unit) in keys.items():
+        given: float | None = getattr(section, key)
         read: float | None = getattr(metadata, key)
         if read is None or given == read:
             continue
-        values: dict[str, float | str] = {"words": words, "given": given, "read": read}
-        values |= {"unit": unit, "source": metadata.source, "key": f"optics.{key}"}
-        if given == type(optics).model_fields[key].default:
+        values: dict[str, float | str] = {"words": words, "read": read, "given": given or math.nan}
+        name = "optics" if optics else "camera"
+        values |= {"unit": unit, "source": metadata.source, "key": f"{name}.{key}"}
+        if given == type(section).model_fields[key].default:
             found[key] = read
-            notes.append(OPTICS_OF_FILE(values))
-        elif abs(read / given - 1) > 0.05:  # measured, it is some percent below the engraved one
-            notes.append(METADATA_DISAGREES(values))
-    if not found:
-        return optics, notes
+            if optics:
+                notes.append(of_files.OPTICS_OF_FILE(values))
+        # rounding aside; an NA that was measured is some percent below the engraved one
+        elif given is not None and abs(read / given - 1) > (0.05 if optics else 0.01):
+            notes.append(of_files.METADATA_DISAGREES(values))
+    if "pixel_size_nm" in found:
+        _refuse_unlikely(found["pixel_size_nm"], metadata.source)
+    if not optics:
+        return section.model_copy(update=found), notes
     try:
-        return Optics(**{**optics.model_dump(), **found}), notes
+        return type(section)(**{**section.model_dump(), **found}), notes
     except ConfigError as error:
         raise DataError(
             f"the movie's {metadata.source} metadata do not suit the configuration: {error}"
@@ -614,7 +581,7 @@ def _coarse_pixels(config: Config, where: str) -> Finding | None:
     spot_nm = optics.wavelength_nm / (2 * optics.na)
     if pixel_nm is None or pixel_nm <= spot_nm:
         return None
-    finding = COARSE_PIXELS({"pixel_nm": pixel_nm, "where": where, "spot_nm": spot_nm})
+    finding = of_files.COARSE_PIXELS({"pixel_nm": pixel_nm, "where": where, "spot_nm": spot_nm})
     if pixel_nm > 2 * spot_nm:
         problem = finding.text.partition(", so that")[0]
         raise DataError(

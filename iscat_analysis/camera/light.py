@@ -24,44 +24,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.background import find_defects
 from iscat_analysis.camera.counts import Camera, float_type
+from iscat_analysis.camera.moments import find_defects
 from iscat_analysis.camera.spectrum import measure_spectrum
 from iscat_analysis.findings import Finding
-from iscat_analysis.findings.camera import (
-    LIGHT_ADDED,
-    LIGHT_FRINGES,
-    LIGHT_SEAMS,
-    LIGHT_SMOOTH,
-    LINES_FLICKER,
-)
+from iscat_analysis.findings import camera as of
 from iscat_analysis.movie import ChangedFrames
 from iscat_analysis.records import BoolArray, FloatArray
 
 Axes = tuple[FloatArray, FloatArray, BoolArray]
 """Functions of rows (y, k) and of columns (x, m), and which of their products are fitted (k, m)."""
-
-
-class Component(Protocol):
-    """A change of the light; false where there is none."""
-
-    def __bool__(self) -> bool: ...
-
-    def axes(self, shape: tuple[int, int]) -> Axes:
-        """Give the columns of the design matrix as products."""
-
-    def finding(self, name: str) -> Finding:
-        """Give what the user should know."""
-
-    @property
-    def summary(self) -> dict[str, Any]:
-        """What ``summary.json`` says of it."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +59,7 @@ class Smooth:
 
     def finding(self, name: str) -> Finding:
         """Tell that the light changes slowly over the field."""
-        return LIGHT_SMOOTH({"percent": 100 * self.rms, "degree": self.degree}, where=name)
+        return of.LIGHT_SMOOTH({"percent": 100 * self.rms, "degree": self.degree}, where=name)
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -125,7 +103,7 @@ class Fringes:
     def finding(self, name: str) -> Finding:
         """Tell which fringes pass."""
         periods = " and ".join(f"{period:.3g}" for period in self.periods_px)
-        return LIGHT_FRINGES({"periods": periods, "percent": 100 * self.rms}, where=name)
+        return of.LIGHT_FRINGES({"periods": periods, "percent": 100 * self.rms}, where=name)
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -161,12 +139,16 @@ class Seams:
             for axis, at in (("row", self.rows), ("column", self.columns))
             if at
         )
-        return LIGHT_SEAMS({"parts": parts}, where=name)
+        return of.LIGHT_SEAMS({"parts": parts}, where=name)
 
     @property
     def summary(self) -> dict[str, Any]:
         """What ``summary.json`` says of it."""
         return {"seam_rows": list(self.rows), "seam_columns": list(self.columns)}
+
+
+Component = Smooth | Fringes | Seams
+"""A change of the light; false where there is none."""
 
 
 def _polynomials(n: int, degree: int) -> FloatArray:
@@ -216,12 +198,12 @@ class LightModel:
         """Give what the user should know, one finding for each component."""
         found = [part.finding(name) for part in self.components if part]
         if self.added:
-            found.append(LIGHT_ADDED({"percent": 100 * self.added}, where=name))
+            found.append(of.LIGHT_ADDED({"percent": 100 * self.added}, where=name))
         if any(self.shares):
             flicker = [(n, s) for n, s in zip(("rows", "columns"), self.shares, strict=True) if s]
             lines = " and ".join(n for n, _ in flicker)
             percents = " and ".join(f"{100 * share:.2g} %" for _, share in flicker)
-            found.append(LINES_FLICKER({"lines": lines, "percents": percents}, where=name))
+            found.append(of.LINES_FLICKER({"lines": lines, "percents": percents}, where=name))
         return found
 
     @property
@@ -244,16 +226,12 @@ class LightModel:
     def _inverse(self) -> FloatArray:
         """Pseudoinverse that turns overlaps with the columns of the design into coefficients."""
         rows, columns, products = self._axes
-        down, along = np.nonzero(products)
-        gram = np.array([
-            ((rows * rows[:, i : i + 1]).T @ self.light_e @ (columns * columns[:, j : j + 1]))[
-                down, along
-            ]
-            for i, j in zip(down, along, strict=True)
-        ])  # fmt: skip
+        light = self.light_e
+        terms = ((rows[:, [i]], columns[:, [j]]) for i, j in np.argwhere(products))
+        gram = np.array([((rows * r).T @ light @ (columns * c))[products] for r, c in terms])
         if self.added:
-            light, more = self.light_e, lift(self.light_e)
-            mixed = (rows.T @ (light * more) @ columns)[down, along]
+            more = lift(light)
+            mixed = (rows.T @ (light * more) @ columns)[products]
             gram = np.block([[gram, mixed[:, None]], [mixed, np.sum(light * more**2)]])
         # directions of which the field tells less than that share of the best one are left out
         return np.asarray(np.linalg.pinv(gram, rcond=1e-10, hermitian=True))
@@ -285,18 +263,14 @@ class LightModel:
         """
         used = self.light_e > 0
         seen = np.where(used, electrons, 0.0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            frame = seen.sum(axis=(-2, -1), keepdims=True) / self.light_e.sum()
-            out = np.ones((*electrons.shape[:-2], 1, 1))
-            if self.uneven:
-                out = self._distribution(seen)
-                seen = seen / out
-            for axis, share in zip((-1, -2), self.shares, strict=True):
-                if not share:
-                    continue
-                line = self.light_e.sum(axis=axis, keepdims=True)
-                factor = seen.sum(axis=axis, keepdims=True) / line / frame
+        frame = seen.sum(axis=(-2, -1), keepdims=True) / self.light_e.sum()
+        out = self._distribution(seen) if self.uneven else np.ones((*electrons.shape[:-2], 1, 1))
+        seen = seen / out
+        for axis, share in zip((-1, -2), self.shares, strict=True):
+            if share:
+                line = self.light_e.sum(axis=axis, keepdims=True) * frame
                 lit = (used.mean(axis=axis, keepdims=True) > 0.25) & (frame > 0)
+                factor = seen.sum(axis=axis, keepdims=True) / np.where(lit, line, 1.0)
                 out = out * np.where(lit & (factor > 0), factor, 1.0)
         return out
 
@@ -352,10 +326,7 @@ class PartOfLight:
         return self.whole.taken(whole)[self.here]
 
     def left(self, signal: FloatArray) -> FloatArray:
-        """Give what is left of a signal after the division.
-
-        Shapes: `signal` (y, x), result (y, x).
-        """
+        """Give what is left of a signal after the division."""
         return (1 + signal) / self.taken(signal) - 1
 
 

@@ -34,12 +34,8 @@ from iscat_analysis.camera.light import Fringes, LightModel, Seams, Smooth, lift
 from iscat_analysis.medians import robust_sigma
 from iscat_analysis.records import BoolArray, FloatArray
 
-HIGHEST_DEGREE = 12
-"""Of a polynomial that is divided out: over a field of 128 pixels it follows waves of 40."""
-
 _PIXELS_PER_TERM = 150  # fewer would take more of a particle's light than its neighbours'
 _CELLS = 20  # along each axis of the grid on which changes are looked for
-_CLIP_SIGMAS = 4.0  # robust standard deviations beyond which a cell shows something else
 _FEWEST_LINES = 8  # of a part between seams
 _SEAM_DEGREE, _WAVE_DEGREE = 6, 8  # of the smooth light over which seams and waves must stand out
 _PARTS = 8  # along each axis, whose added light is compared
@@ -97,31 +93,39 @@ class Changes:
             return self
         return replace(self, sums_e=self.sums_e / model.factors(self.sums_e))
 
+    def relative(self, sums: FloatArray, light: FloatArray) -> FloatArray:
+        """Give changes of the shares that parts of the field have, in standard deviations of noise.
+
+        Shapes: `sums` (pairs, 2, parts), `light` (parts,), result (pairs, parts).
+        """
+        before, after = np.moveaxis(sums / sums.sum(axis=-1, keepdims=True), 1, 0)
+        noise = np.sqrt(np.where(light > 0, light, 1.0) * self.noises[:, None])
+        return np.where(light > 0, (after - before) * light.sum() / noise, 0.0)
+
     def binned(self, side: int) -> tuple[FloatArray, FloatArray]:
         """Give the changes of squares of pixels.
 
         Shapes: `changes` (pairs, y, x), `light_e` (y, x).
         """
-        light = squares(self.light_e, side)
-        before, after = np.moveaxis(squares(self.sums_e, side), 1, 0)
-        changes = after / after.sum(axis=(1, 2), keepdims=True)
-        changes -= before / before.sum(axis=(1, 2), keepdims=True)
-        changes *= light.sum()
-        changes /= np.sqrt(np.where(light > 0, light, 1.0) * self.noises[:, None, None])
-        return np.where(light > 0, changes, 0.0), light
+        shape = tuple(n // side for n in self.light_e.shape)
+        sums, light = (
+            _summed(values[..., : shape[0] * side, : shape[1] * side], shape)
+            for values in (self.sums_e, self.light_e)
+        )
+        return self.relative(sums, light).reshape(-1, *shape), light.reshape(shape)
 
 
-def squares(values: FloatArray, side: int) -> FloatArray:
-    """Sum over squares of pixels.
+def _summed(values: FloatArray, parts: tuple[int, ...]) -> FloatArray:
+    """Sum over parts of the field, as many along each axis as is said.
 
-    Shapes: `values` (…, y, x), result (…, y // side, x // side).
+    Shapes: `values` (…, y, x), result (…, parts).
     """
-    if side == 1:
-        return values
-    *before, rows, columns = values.shape
-    high, wide = rows // side, columns // side
-    cut = values[..., : high * side, : wide * side].reshape(*before, high, side, wide, side)
-    return np.asarray(cut.sum(axis=(-3, -1)))
+    for axis, most in zip((-2, -1), parts, strict=True):
+        size = values.shape[axis]
+        number = min(most, size)
+        starts = -(-np.arange(number) * size // number)
+        values = np.add.reduceat(values, starts, axis=axis)
+    return values.reshape(*values.shape[:-2], -1)
 
 
 def find_light(
@@ -136,8 +140,9 @@ def find_light(
     changes = Changes.of(pairs, camera)
     if changes is None:
         return None
+    # over a field of 128 pixels a polynomial of degree 12 follows waves of 40
     room = math.sqrt(2 * changes.used.sum() / _PIXELS_PER_TERM)
-    highest = min(HIGHEST_DEGREE, math.floor(room) - 2)
+    highest = min(12, math.floor(room) - 2)
     if highest < 3:  # without which smooth is not told from fine
         return None
     model = LightModel(changes.light_e)
@@ -182,10 +187,8 @@ def _steps_along(
     """Find the steps along an axis of (pairs, y, x), three at most."""
     light = changes.light_e.sum(axis=axis - 1)
     lit = np.flatnonzero(light > 0)
-    before, after = np.moveaxis(changes.sums_e.sum(axis=axis + 1)[..., lit], 1, 0)
     light, count = light[lit], lit.size
-    change = after / after.sum(axis=1, keepdims=True) - before / before.sum(axis=1, keepdims=True)
-    change *= light.sum() / np.sqrt(light * changes.noises[:, None])
+    change = changes.relative(changes.sums_e.sum(axis=axis + 1)[..., lit], light)
     if count < 2 * _FEWEST_LINES + _SEAM_DEGREE:
         return known
     differences = change[:, 2:-1] + change[:, 3:] - change[:, 1:-2] - change[:, :-3]
@@ -367,35 +370,26 @@ def _in_cells(
     Returns the degree of each column, −1 of waves; the columns (cells, terms), orthonormal; and the
     changes (pairs, cells) in standard deviations of shot noise.
     """
-    used, light = changes.used, changes.light_e
-    y, x = np.nonzero(used)
-    rows, columns = used.shape
-    cell = (y * _CELLS // rows) * _CELLS + x * _CELLS // columns
-
-    def total(values: NDArray[Any]) -> FloatArray:
-        return np.bincount(cell, values, minlength=_CELLS**2).astype(np.float64)
-
-    pixels = total(np.ones(cell.size))
+    used, light, grid = changes.used, changes.light_e, (_CELLS, _CELLS)
+    pixels = _summed(used.astype(np.float64), grid)
     lit = pixels > 0
-    inside = total(light[used])[lit]
+    inside = _summed(light, grid)[lit]
     place_y, place_x = (
-        2 * total(k)[lit] / pixels[lit] / max(n - 1, 1) - 1 for k, n in ((y, rows), (x, columns))
+        2 * _summed(np.where(used, k, 0.0), grid)[lit] / pixels[lit] / max(n - 1, 1) - 1
+        for k, n in zip(np.indices(used.shape), used.shape, strict=True)
     )
-    powers = np.add.outer(np.arange(highest + 1), np.arange(highest + 1))
-    order = np.argsort(powers, axis=None, kind="stable")
-    order = order[powers.ravel()[order] <= highest]
-    terms = [legvander2d(place_y, place_x, [highest, highest])[:, order]]
-    down, along, products = fringes.axes((rows, columns))
-    for i, j in np.argwhere(products):
-        wave = total(light[used] * down[y, i] * along[x, j])
-        terms.insert(0, wave[lit, None] / inside[:, None])
-    basis, _ = np.linalg.qr(np.sqrt(inside)[:, None] * np.hstack(terms))
-    degrees = np.concatenate([np.full(int(products.sum()), -1), powers.ravel()[order]])
-    out = np.empty((len(changes.sums_e), inside.size))
-    for k, two in enumerate(changes.sums_e):
-        before, after = (total(part[used])[lit] / part[used].sum() for part in two)
-        out[k] = (after - before) * inside.sum() / np.sqrt(inside * changes.noises[k])
-    return degrees, basis, out
+    powers = np.add.outer(np.arange(highest + 1), np.arange(highest + 1)).ravel()
+    order = np.argsort(powers, kind="stable")
+    order = order[powers[order] <= highest]
+    down, along, products = fringes.axes((used.shape[0], used.shape[1]))
+    waves = [
+        _summed(light * np.outer(down[:, i], along[:, j]), grid)[lit, None] / inside[:, None]
+        for i, j in np.argwhere(products)
+    ]
+    smooth = legvander2d(place_y, place_x, [highest, highest])[:, order]
+    basis, _ = np.linalg.qr(np.sqrt(inside)[:, None] * np.hstack([*waves, smooth]))
+    degrees = np.concatenate([np.full(len(waves), -1), powers[order]])
+    return degrees, basis, changes.relative(_summed(changes.sums_e, grid)[..., lit], inside)
 
 
 def _cell_squares(cells: FloatArray, basis: FloatArray) -> tuple[FloatArray, float]:
@@ -433,7 +427,7 @@ def _cell_squares(cells: FloatArray, basis: FloatArray) -> tuple[FloatArray, flo
 
 def _near(deviations: FloatArray) -> BoolArray:
     """Tell which deviations, in standard deviations of noise, are no outliers."""
-    return np.asarray(np.abs(deviations) <= _CLIP_SIGMAS * max(1.0, robust_sigma(deviations)))
+    return np.asarray(np.abs(deviations) <= 4.0 * max(1.0, robust_sigma(deviations)))
 
 
 # ---- added light -----------------------------------------------------------------------------
@@ -442,14 +436,9 @@ def _near(deviations: FloatArray) -> BoolArray:
 def _added(changes: Changes, window: int) -> float:
     """Measure a change that is added to all pixels equally, over the mean light; 0 if none."""
     light, more = changes.light_e, lift(changes.light_e)
-    rows, columns = (
-        np.equal.outer(np.arange(_PARTS), np.arange(n) * _PARTS // n).astype(np.float64)
-        for n in light.shape
-    )
 
     def summed(values: FloatArray) -> FloatArray:
-        parts: FloatArray = rows @ values @ columns.T
-        return parts.reshape(*values.shape[:-2], -1)
+        return _summed(values, (_PARTS, _PARTS))
 
     inside, once, twice = summed(light), summed(light * more), summed(light * more**2)
     pattern = np.maximum(twice - np.square(once) / np.where(inside > 0, inside, 1.0), 0.0)
@@ -460,17 +449,14 @@ def _added(changes: Changes, window: int) -> float:
     if lit.sum() < _PARTS**2 // 4:
         return 0.0
     mean, pattern = once[lit] / inside[lit], pattern[lit]
-    pixels = summed((light > 0).astype(np.float64))[lit]
     noise = changes.noises.mean() / len(changes.noises)
-    if pattern.sum() < 10 * pixels.sum() * noise:  # a pattern of the mean frame's noise
+    if pattern.sum() < 10 * changes.used.sum() * noise:  # a pattern of the mean frame's noise
         return 0.0
-    bright = np.where(light > 0, light, 1.0)
-    levels, lifts, sizes = [], [], []
+    levels, lifts = [], []
     for sums in changes.sums_e:  # one pair after the other, to save memory
         each = sums * (light.sum() / sums.sum(axis=(1, 2), keepdims=True)) - light
         levels.append(summed(each)[:, lit])
         lifts.append(summed(each * more)[:, lit])
-        sizes.append(summed(np.square(each[1] - each[0]) / bright)[lit])
     level, lifted = np.array(levels), np.array(lifts)
     even = level[:, 1] - level[:, 0]
     change = lifted[:, 1] - lifted[:, 0] - even * mean
@@ -483,13 +469,6 @@ def _added(changes: Changes, window: int) -> float:
     if square * pattern.sum() / light.sum() < changes.least(window) + changes.error:
         return 0.0
     if np.median(np.square(added[:, 0]) / error) < 30:  # by the differences of the parts
-        return 0.0
-    # in variances of noise, of the pixels of a part
-    noises = changes.noises[:, None]
-    gain = np.square(added) * pattern / noises
-    left = np.array(sizes) / noises - np.square(even) / inside[lit] / noises - gain - (pixels - 1)
-    doubt = _CLIP_SIGMAS * math.sqrt(2 * float(pixels.mean()) / left.size)
-    if np.median(left) > np.median(gain) + doubt:
         return 0.0
     here = lifted - level * mean
     return float(np.ptp(here.sum(axis=-1))) / float(pattern.sum())

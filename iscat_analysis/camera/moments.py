@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from iscat_analysis.camera.counts import Camera, full_scale_of
 from iscat_analysis.errors import DataError
@@ -140,7 +141,13 @@ def moments_of(
 KINDS = ("saturated", "clipped", "dead", "hot")
 """What may be wrong with a pixel."""
 
-_DARK, _BRIGHT = 0.2, 5.0  # of the neighbours' median, as in the stage background
+DEAD, HOT = 0.2, 5.0
+"""A pixel below or above these multiples of the median of its neighbours is left out."""
+
+DEFECT_SIGMAS = 6.0
+"""Unless noise alone could have put it there: dark backgrounds scatter by more than their mean."""
+
+_NEIGHBOURS = 5  # pixels along each side, whose median tells what a pixel should hold
 _OUTLIER_SIGMAS = 8.0
 
 
@@ -159,15 +166,45 @@ def saturated(highest: NDArray[Any], name: str) -> BoolArray:
     return full
 
 
-def unlike_neighbours(light: FloatArray, *, low: float = _DARK, high: float = _BRIGHT) -> BoolArray:
-    """Find pixels far darker or brighter than their neighbours.
+def find_defects(before_e: FloatArray, read_variance_e2: FloatArray) -> BoolArray:
+    """Find dead and hot pixels: far from the median of their neighbours, beyond noise.
 
-    Shapes: `light` (y, x), result (y, x).
+    Shapes: `before_e` (y, x), `read_variance_e2` (y, x), result (y, x).
     """
-    local = np.maximum(median_filter(light, size=5, mode="nearest"), 0.0)
-    with np.errstate(invalid="ignore"):
-        found: BoolArray = (light < low * local) | (light > high * local)
-    return np.asarray(found & (local > 0), dtype=np.bool_)
+    local = _usual(before_e)
+    off = (before_e < DEAD * local) | (before_e > HOT * local)
+    # Anscombe's transform makes the noise 1 at every level, a few counts included.
+    steady, expected = (
+        2 * np.sqrt(np.maximum(counts + 0.375 + read_variance_e2, 0.0))
+        for counts in (before_e, local)
+    )
+    return np.asarray(off & (np.abs(steady - expected) > DEFECT_SIGMAS))
+
+
+def unlike_neighbours(light: FloatArray) -> tuple[BoolArray, BoolArray]:
+    """Find pixels that are far darker, and such that are far brighter, than their neighbours.
+
+    Shapes: `light` (y, x), results (y, x).
+    """
+    local = _usual(light)
+    return (light < DEAD * local) & (local > 0), (light > HOT * local) & (local > 0)
+
+
+def _usual(light: FloatArray) -> FloatArray:
+    """Median of the neighbours of pixels that may be far from it; the others as they are.
+
+    A median lies between the lowest and the highest of its neighbours, which are found sooner.
+    """
+    lowest, highest = (
+        np.maximum(extreme(light, size=_NEIGHBOURS, mode="nearest"), 0.0)
+        for extreme in (minimum_filter, maximum_filter)
+    )
+    doubtful = (light < DEAD * highest) | (light > HOT * lowest)
+    padded = np.pad(light, _NEIGHBOURS // 2, mode="edge")
+    around = sliding_window_view(padded, (_NEIGHBOURS, _NEIGHBOURS))[doubtful]
+    usual = light.copy()
+    usual[doubtful] = np.maximum(np.median(around.reshape(-1, _NEIGHBOURS**2), axis=1), 0.0)
+    return usual
 
 
 def clipped(lowest: NDArray[Any]) -> BoolArray:
@@ -196,12 +233,10 @@ def unsteady(found: Sequence[Moments], used: BoolArray) -> BoolArray:
     """
     out = np.zeros(used.shape, dtype=np.bool_)
     for item in found:
-        mean, variance = item.mean[used], item.variance[used]
-        smooth = np.empty(mean.size)
-        for part in brightness_bins(mean):
+        variance, smooth = item.variance[used], np.empty(np.count_nonzero(used))
+        for part in brightness_bins(item.mean[used]):
             smooth[part] = np.median(variance[part])
-        limit = 1 + _OUTLIER_SIGMAS * item.relative_se
-        out[used] |= variance > limit * smooth
+        out[used] |= variance > (1 + _OUTLIER_SIGMAS * item.relative_se) * smooth
     return out
 
 

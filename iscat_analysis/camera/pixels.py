@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,7 +31,7 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.camera import PIXELS_UNSTEADY, TEXT_BURNT_IN
 from iscat_analysis.medians import SIGMA_PER_MAD, robust_sigma
-from iscat_analysis.movie import ChangedFrames, Stack
+from iscat_analysis.movie import Stack
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.units import count, listed
 
@@ -41,24 +40,6 @@ _FEWEST = 16
 _AGAIN = 0.02  # of the frames that have the same count, at least and at most
 _LEAST_PIXELS = 8  # of a text
 _MARGIN = 1  # pixel around a text, for letters that are smooth
-
-
-@dataclass(frozen=True, eq=False)
-class PatchedFrames(ChangedFrames):
-    """Frames whose text is covered with the rows beside it, which have the light of any."""
-
-    rows: NDArray[np.int64]
-    text: BoolArray
-
-    def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Read frames.
-
-        Shapes: result (stop − start, y, x).
-        """
-        counts = self.source.read(start, stop)
-        y, x = np.nonzero(self.text)
-        counts[:, y, x] = counts[:, self.rows[y, x], x]
-        return counts
 
 
 def text_finding(text: BoolArray, name: str) -> Finding:
@@ -88,31 +69,12 @@ def boxes_of(text: BoolArray) -> list[tuple[slice, slice]]:
     return [(box[0], box[1]) for box in find_objects(label(text)[0])]
 
 
-def patched(movie: Stack, text: BoolArray) -> Stack:
-    """Cover a text with the light of the nearest rows that have none.
-
-    Shapes: `text` (y, x).
-    """
-    free = np.flatnonzero(~text.any(axis=1))
-    rows = np.tile(np.arange(text.shape[0])[:, None], (1, text.shape[1]))
-    for top, part in ((box[0].start, box) for box in boxes_of(text)):
-        high = part[0].stop - top
-        starts = [
-            s for s in range(text.shape[0] - high + 1) if np.isin(range(s, s + high), free).all()
-        ]
-        if starts:
-            start = min(starts, key=lambda s: abs(s - top))
-            rows[part] += start - top
-    return movie.seen_as(PatchedFrames(movie, rows.astype(np.int64), text))
-
-
 def without_text(movie: Stack, text: BoolArray, camera: Camera) -> Stack:
     """Leave the pixels of a text out, as dead ones.
 
     Shapes: `text` (y, x).
     """
-    dark = np.broadcast_to(np.floor(camera.offset_adu), text.shape)[text].astype(movie.dtype)
-    return movie.without(text, dark)
+    return movie.without(text, camera.without_light(movie)[text])
 
 
 def find_text(movie: Stack, span: tuple[int, int]) -> BoolArray | None:
@@ -146,14 +108,11 @@ def find_text(movie: Stack, span: tuple[int, int]) -> BoolArray | None:
     text = np.zeros_like(letters)
     # pixels between letters
     for box in find_objects(label(binary_dilation(letters, iterations=4))[0]):
-        y, x = np.nonzero(letters[box])
-        if y.size >= _LEAST_PIXELS:
-            top, left = box[0].start + int(y.min()), box[1].start + int(x.min())
-            bottom, right = box[0].start + int(y.max()), box[1].start + int(x.max())
-            text[
-                max(top - _MARGIN, 0) : bottom + _MARGIN + 1,
-                max(left - _MARGIN, 0) : right + _MARGIN + 1,
-            ] = True
+        inside = np.nonzero(letters[box])
+        if inside[0].size >= _LEAST_PIXELS:
+            corners = zip(box, inside, strict=True)
+            spans = [(part.start + int(k.min()), part.start + int(k.max())) for part, k in corners]
+            text[tuple(slice(max(a - _MARGIN, 0), b + _MARGIN + 1) for a, b in spans)] = True
     return text if 0 < text.mean() < 0.25 else None  # of the field
 
 
@@ -232,7 +191,7 @@ def find_unsteady(
         return None
     variance = np.where(lit, light + camera.read_variance_e2(light.shape), np.inf)
     gain, offset = (
-        np.ascontiguousarray(np.broadcast_to(np.asarray(value, dtype=np.float64), shape))
+        np.full(shape, value, dtype=np.float64)
         for value in (camera.gain_e_per_adu, camera.offset_adu)
     )
     fast, slow = _Scatter(shape), _Scatter(shape)
@@ -243,7 +202,7 @@ def find_unsteady(
         if power.min() <= 0:
             return None
         add_scatter(block, gain, offset, power, mean, change, fast.squares, fast.products)
-        slow.add((mean - light) * np.sqrt(len(block)))
+        add_image((mean - light) * np.sqrt(len(block)), slow.squares, slow.products)
     for scatter, number in ((fast, freedom[0]), (slow, freedom[1])):
         ratio = np.where(lit, scatter.squares / variance / number, 0.0)
         usual = float(np.median(ratio[lit]))
@@ -251,7 +210,7 @@ def find_unsteady(
             continue
         limit = chdtri(number, 1e-9) / number  # by chance
         more = ratio > usual * limit
-        more &= scatter.neighbour_products < least_beside * scatter.squares
+        more &= scatter.products.max(axis=0) < least_beside * scatter.squares
         more &= _largest_neighbour(ratio) - usual < least_beside * (ratio - usual)
         if more.any():  # by those around as well, which takes longest
             more &= ratio > median_filter(ratio, _AROUND, mode="nearest") * limit
@@ -276,16 +235,6 @@ class _Scatter:
     def __init__(self, shape: tuple[int, ...]) -> None:
         self.squares = np.zeros(shape)
         self.products = np.zeros((2, *shape))
-
-    def add(self, image: FloatArray) -> None:
-        """Add one image."""
-        add_image(image, self.squares, self.products)
-
-    @property
-    def neighbour_products(self) -> FloatArray:
-        """Products with the neighbours along y or x, whichever are larger."""
-        largest: FloatArray = self.products.max(axis=0)
-        return largest
 
 
 def _noisy_lines(ratio: FloatArray, lit: BoolArray, usual: float, least_beside: float) -> BoolArray:

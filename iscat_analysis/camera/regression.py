@@ -37,6 +37,15 @@ class Estimate:
         return self.value - _Z95 * self.se, self.value + _Z95 * self.se
 
 
+_ARRAYS = ("curve", "masked", "maps")
+
+
+def _plain(value: Any) -> Any:
+    if not isinstance(value, Estimate):
+        return value
+    return {"value": value.value, "se": value.se, "ci95": list(value.ci95)}
+
+
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
     """What the noise says of a camera; `measure_camera` makes it."""
@@ -58,36 +67,19 @@ class CameraCalibration:
 
     def to_dict(self) -> dict[str, Any]:
         """Give what ``camera.json`` holds."""
-
-        def plain(estimate: Estimate | None) -> dict[str, Any] | None:
-            if estimate is None:
-                return None
-            return {"value": estimate.value, "se": estimate.se, "ci95": list(estimate.ci95)}
-
-        return {
-            "gain_e_per_adu": plain(self.gain_e_per_adu),
-            "offset_adu": plain(self.offset_adu),
-            "offset_from": self.offset_from,
-            "read_noise_adu": plain(self.read_noise_adu),
-            "read_noise_e": plain(self.read_noise_e),
-            "read_noise_below_e": self.read_noise_below_e,
-            "shot_limited_frames": self.shot_limited_frames,
-            "verdict": self.verdict,
-            "frames": self.frames,
+        held = vars(self) | {
             "masked_pixels": {name: int(mask.sum()) for name, mask in self.masked.items()},
             "photon_transfer": self.curve.to_dict("list"),
             "noise": self.noise.to_dict("list"),
             "notes": list(self.notes),
         }
+        return {key: _plain(value) for key, value in held.items() if key not in _ARRAYS}
 
     def to_toml(self, maps: dict[str, str] | None = None) -> str:
         """Write the section ``[camera]`` to paste into a configuration."""
         lines = ["[camera]"]
-        for key, estimate in (
-            ("gain_e_per_adu", self.gain_e_per_adu),
-            ("offset_adu", self.offset_adu),
-            ("read_noise_e", self.read_noise_e),
-        ):
+        for key in ("gain_e_per_adu", "offset_adu", "read_noise_e"):
+            estimate: Estimate | None = getattr(self, key)
             if estimate is None:
                 continue
             low, high = estimate.ci95
@@ -285,14 +277,11 @@ def _with_dark(
         if slope <= 0:
             raise DataError("the light adds no noise: these are not raw counts; give raw frames")
         weight = frames / np.square(np.maximum(slope * light, 1e-12) + variance.min())
-        new = float(np.sum(weight * light * shot) / np.sum(weight * light**2))
-        done = abs(new - slope) < 1e-12 * slope
-        slope = new
-        if done:
+        last, slope = slope, float(weight @ (light * shot)) / float(weight @ light**2)
+        if abs(slope - last) < 1e-12 * last:
             break
-    se = math.sqrt(float(np.sum((weight * light * (shot - slope * light)) ** 2))) / float(
-        np.sum(weight * light**2)
-    )
+    scatter = float(np.linalg.norm(weight * light * (shot - slope * light)))
+    se = scatter / float(weight @ light**2)
     gain = Estimate(1 / slope, se / slope**2)
     offset, read = dark_numbers(dark, used)
     electrons = Estimate(
@@ -340,10 +329,8 @@ def _ratio(
         "there is one level of light only: the read noise is taken as zero, and the gain is too "
         "small by the factor 1 + σ_r²/μ; a dark removes the assumption"
     )
-    return Solution(
-        Estimate(1 / ratio, se / ratio**2), offset, source, None, None, None,
-        -ratio * offset.value, ratio,
-    )  # fmt: skip
+    gain = Estimate(1 / ratio, se / ratio**2)
+    return Solution(gain, offset, source, None, None, None, -ratio * offset.value, ratio)
 
 
 def variance_line(
@@ -353,23 +340,36 @@ def variance_line(
 
     Shapes: `x, y` (n,), `frames` (n,), `tiles` (n,), `theta` (2,), `covariance` (2, 2).
     """
-    centre, scale = float(x.mean()), float(x.std())
-    design = np.stack([np.ones_like(x), (x - centre) / scale], axis=1)
     fit = np.full(x.shape, y.mean())
     for _ in range(25):
         weight = frames / np.square(np.maximum(fit, 0.05 * y.mean()))
-        normal = design.T @ (design * weight[:, np.newaxis])
-        theta = np.linalg.solve(normal, design.T @ (weight * y))
-        new = design @ theta
+        centre, theta, cov = _line(x, y, weight, tiles)
+        new = theta[0] + theta[1] * (x - centre)
         done = np.max(np.abs(new - fit)) < 1e-10 * y.mean()
         fit = new
         if done:
             break
-    inverse = np.linalg.inv(normal)
-    score = _together(design * (weight * (y - fit))[:, np.newaxis], tiles)
-    cov = inverse @ (score.T @ score) @ inverse
-    back = np.array([[1.0, -centre / scale], [0.0, 1 / scale]])
+    back = np.array([[1.0, -centre], [0.0, 1.0]])
     return back @ theta, back @ cov @ back.T
+
+
+def _line(
+    x: FloatArray, y: FloatArray, weight: FloatArray, tiles: NDArray[np.int64] | None
+) -> tuple[float, FloatArray, FloatArray]:
+    """Fit a weighted line: its centre, level and slope there, and their covariance.
+
+    Errors are from the scatter of pixels; those of one of the `tiles` may deviate together.
+
+    Shapes: `x, y, weight` (n,), `tiles` (n,), `theta` (2,), `covariance` (2, 2).
+    """
+    centre = float(np.average(x, weights=weight))
+    design = np.stack([np.ones_like(x), x - centre])
+    inverse = 1 / np.sum(weight * design**2, axis=1)
+    theta = inverse * (design @ (weight * y))
+    score = design * (weight * (y - theta @ design))
+    if tiles is not None:
+        score = np.stack([np.bincount(tiles, weights=part) for part in score])
+    return centre, theta, np.outer(inverse, inverse) * (score @ score.T)
 
 
 def _offset(
@@ -405,13 +405,6 @@ def _offset(
     return Estimate(value, se), "flicker"
 
 
-def _together(score: FloatArray, tiles: NDArray[np.int64] | None) -> FloatArray:
-    """Sum the scores (n, k) of pixels whose deviations may be correlated."""
-    if tiles is None:
-        return score
-    return np.stack([np.bincount(tiles, weights=column) for column in score.T], axis=1)
-
-
 def zero_of_flicker(
     slope: FloatArray,
     variance: FloatArray,
@@ -424,25 +417,14 @@ def zero_of_flicker(
     """
     if not np.isfinite(slope).all() or mean.std() == 0:
         return None
-    weight = 1 / variance
     kept = np.ones(slope.shape, dtype=np.bool_)
     for _ in range(4):
-        w = np.where(kept, weight, 0.0)
-        centre = float(np.sum(w * mean) / w.sum())
-        x = mean - centre
-        level = float(np.sum(w * slope) / w.sum())
-        gradient = float(np.sum(w * x * slope) / np.sum(w * x * x))
-        residual = (slope - level - gradient * x) * np.sqrt(weight)
+        centre, (level, gradient), cov = _line(mean, slope, kept / variance, tiles)
+        residual = (slope - level - gradient * (mean - centre)) / np.sqrt(variance)
         robust = robust_sigma(residual)
         kept = np.abs(residual) < 5 * max(robust, 1e-12)
-    if robust**2 > 2.0 or gradient <= 0:  # the scene has moved
+    level_se, gradient_se = np.sqrt(np.diag(cov))
+    if robust**2 > 2.0 or gradient <= max(0, 5 * gradient_se):  # the scene has moved
         return None
-    rest = w * (slope - level - gradient * x)
-    by_level, by_gradient = _together(np.stack([rest, rest * x], axis=1), tiles).T
-    gradient_se = math.sqrt(float(np.sum(by_gradient**2))) / float(np.sum(w * x * x))
-    level_se = math.sqrt(float(np.sum(by_level**2))) / float(w.sum())
-    if gradient < 5 * gradient_se:
-        return None
-    zero = centre - level / gradient
     se = math.hypot(level_se / gradient, level / gradient**2 * gradient_se)
-    return Estimate(zero, se)
+    return Estimate(centre - level / gradient, se)

@@ -19,7 +19,7 @@ from scipy import fft
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.camera import NOISE_CORRELATED
-from iscat_analysis.medians import SIGMA_PER_MAD
+from iscat_analysis.medians import robust_sigma
 from iscat_analysis.records import BoolArray, FloatArray
 
 REACH_PX = 6
@@ -103,12 +103,10 @@ class NoiseSpectrum:
     @property
     def summary(self) -> dict[str, Any]:
         """What ``summary.json`` says of the noise."""
-        return {
-            "variance_over_shot": self.variance,
-            "neighbour_correlation": list(self.neighbours),
-            "row_share": self.shared[0],
-            "column_share": self.shared[1],
-        }
+        row, column = self.shared
+        shares = {"row_share": row, "column_share": column}
+        neighbours = list(self.neighbours)
+        return {"variance_over_shot": self.variance, "neighbour_correlation": neighbours, **shares}
 
     @property
     def finding(self) -> Finding | None:
@@ -147,68 +145,52 @@ def measure_spectrum(
         return None
     starts = 2 * np.linspace(0, len(counts) // 2 - 1, pairs).astype(int)
     frames = np.concatenate([starts, starts + 1])
-    gain, offset = camera.gain_e_per_adu, camera.offset_adu
-    mean = gain * (counts[frames].mean(axis=0) - offset)
-    read = camera.read_variance_e2((rows, columns))
-    used = (mean > 0) & ~camera.saturated(counts[frames].max(axis=0))
-    if masked is not None:
-        used &= ~masked
-    if used.mean() < 0.5:
+    mean = camera.to_electrons(counts[frames].mean(axis=0))
+    used = (mean > 0) & camera.usable(counts[frames], masked)
+    if used.mean() < 0.5 or mean[used].mean() < 20.0:  # noise is far from normal
         return None
     light = float(mean[used].mean())
-    if light < 20.0:  # noise is far from normal
-        return None
+    read = camera.read_variance_e2((rows, columns))
+    expected = np.where(used, mean, 1.0)
 
     # rounded to single precision, which is a millionth of the noise and takes half of the time
-    expected, read_noise, scale, zero = (
+    single = [
         np.asarray(value, dtype=np.float32)
-        for value in (np.where(used, mean, 1.0), read, gain, offset)
-    )
+        for value in (expected, read, camera.gain_e_per_adu, camera.offset_adu)
+    ]
 
-    def change(start: int) -> tuple[NDArray[np.float32], float] | None:
-        # in its expected errors, with the size beyond which it is no noise
+    def change(start: int) -> tuple[NDArray[np.float32], float, int] | None:
+        # in its expected errors, with the size beyond which it is no noise, and what is beyond
+        expected, read, gain, offset = single
         before, after = (
-            scale * np.subtract(counts[k], zero, dtype=np.float32) for k in (start, start + 1)
+            gain * np.subtract(counts[k], offset, dtype=np.float32) for k in (start, start + 1)
         )
         powers = [float(frame.mean(where=used)) / light for frame in (before, after)]
         if min(powers) <= 0:
             return None
         by_light, by_frame = (sum(q**-n for q in powers) for n in (1, 2))
         z = after / powers[1] - before / powers[0]
-        z /= np.sqrt(by_light * expected + by_frame * read_noise)
+        z /= np.sqrt(by_light * expected + by_frame * read)
         z[~used] = 0.0
-        # some of as many pixels tell how large the noise is
-        middle = float(np.median(np.abs(z[used][::8])))
-        return z, 5.0 * SIGMA_PER_MAD * middle  # a change beyond is no noise
+        limit = 5.0 * robust_sigma(z[used][::8])  # some pixels tell how large the noise is
+        return z, limit, int(np.count_nonzero(np.abs(z) > limit))
 
-    def outliers(found: tuple[NDArray[np.float32], float] | None) -> int:
-        return 0 if found is None else int(np.count_nonzero(np.abs(found[0]) > found[1]))
-
-    # a pixel that blinks is in every pair; where something bright lands, its rings are no noise
-    # their median is that of a pair in which nothing lands
-    few = starts[:: max(1, pairs // 9)].tolist()
-    most = float(np.median([outliers(change(start)) for start in few])) + 4
-
-    def periodogram(start: int) -> FloatArray | None:
-        found = change(start)
-        if found is None:
-            return np.zeros((rows, columns // 2 + 1))
-        if outliers(found) > most:
-            return None
-        z, limit = found
-        waves = fft.rfft2(np.clip(z, -limit, limit, out=z))
-        return np.asarray(np.square(waves.real) + np.square(waves.imag))
-
-    total, pairs = np.zeros((rows, columns // 2 + 1)), 0
-    for spectrum in map(periodogram, starts.tolist()):
-        if spectrum is not None:
-            total += spectrum
-            pairs += 1
+    # where something bright lands, its rings are no noise; a pixel that blinks is in every pair
+    few = [found[2] for start in starts[:: max(1, pairs // 9)] if (found := change(start))]
+    most = (float(np.median(few)) if few else 0.0) + 4
+    total, number = np.zeros((rows, columns // 2 + 1)), 0
+    for found in map(change, starts.tolist()):
+        if found is not None and found[2] <= most:
+            waves = fft.rfft2(np.clip(found[0], -found[1], found[1], out=found[0]))
+            total += np.square(waves.real) + np.square(waves.imag)
+            number += 1
+    if not number:
+        return None
     # in how many pairs of frames and of used pixels each distance occurs
     alike = fft.irfft2(np.abs(fft.rfft2(used.astype(np.float64))) ** 2, s=(rows, columns))
-    covariance = fft.irfft2(total, s=(rows, columns)) / (pairs * np.maximum(np.rint(alike), 1.0))
-    light = np.sqrt(np.where(used, mean, np.mean(mean, where=used)))
-    return _spectrum_of(covariance, 1 / math.sqrt(pairs * np.count_nonzero(used)), light)
+    covariance = fft.irfft2(total, s=(rows, columns)) / (number * np.maximum(np.rint(alike), 1.0))
+    root = np.sqrt(np.where(used, mean, light))
+    return _spectrum_of(covariance, 1 / math.sqrt(number * np.count_nonzero(used)), root)
 
 
 def _spectrum_of(

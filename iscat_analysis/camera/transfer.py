@@ -101,18 +101,15 @@ def measure_transfer(
     """
     if len(counts) < _LEAST_FRAMES:
         return None
-    used = ~camera.saturated(counts.max(axis=0))
-    if masked is not None:
-        used &= ~masked
     electrons = camera.to_electrons(counts)
     light = electrons.mean(axis=0)
-    used &= (light > 0) & ~unlike_neighbours(light)
+    dark, bright = unlike_neighbours(light)
+    used = camera.usable(counts, masked) & (light > 0) & ~dark & ~bright
     if np.count_nonzero(used) < _LEAST_PIXELS:
         return None
     try:
-        found = moments_of(
-            open_stack(electrons), used, lambda _: None, jumps=_jumps(electrons, light, used)
-        )
+        jumps = _jumps(electrons, light, used)
+        found = moments_of(open_stack(electrons), used, lambda _: None, jumps=jumps)
     except DataError:
         return None
     # of the shot noise; what has less, as a picture that was copied, has none
@@ -158,25 +155,15 @@ def _binned(found: Moments, used: BoolArray, other: FloatArray) -> Transfer:
     if flicker is not None:
         single = zero_of_flicker(*seen)
         wider[1] = max(1.0, flicker.se / single.se) if single is not None else 1.0
-    rows = []
+    rates, rates2 = found.slope[used], found.slope_variance[used]
+    bins = []
     for part in brightness_bins(mean):
-        root = math.sqrt(part.size)
-        rows.append(
-            [
-                mean[part].mean(),
-                variance[part].mean(),
-                wider[0] * variance[part].std(ddof=1) / root,
-                found.slope[used][part].mean(),
-                wider[1] * math.sqrt(found.slope_variance[used][part].mean()) / root,
-            ]
-        )
-    light, noises, noises_se, slopes, slopes_se = np.array(rows).T
-    return Transfer(
-        light, noises, noises_se, slopes, slopes_se, level=level, noise=noise, flicker=flicker
-    )
-
-
-_LEAST_FRAMES, _ZERO_FRAMES = 16, 256
+        noise_sd, rate_sd = variance[part].std(ddof=1), math.sqrt(rates2[part].mean())
+        levels = mean[part].mean(), variance[part].mean(), rates[part].mean()
+        bins.append((*levels, wider[0] * noise_sd, wider[1] * rate_sd, part.size))
+    light, noises, slopes, noises_sd, slopes_sd, number = np.array(bins).T
+    errors = noises_sd / np.sqrt(number), slopes_sd / np.sqrt(number)
+    return Transfer(light, noises, errors[0], slopes, errors[1], level, noise, flicker)
 
 
 @dataclass(frozen=True)
@@ -206,13 +193,10 @@ def find_zero(
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """
     pixels = counts.shape[1] * counts.shape[2]
-    most = min(_ZERO_FRAMES, max(_LEAST_FRAMES, (2**22) // pixels))  # a tenth of a second
+    most = min(256, max(_LEAST_FRAMES, (2**22) // pixels))  # a tenth of a second
     found = measure_transfer(counts[:most], camera, masked=masked)
-    return None if found is None else zero_of(found)
-
-
-def zero_of(found: Transfer) -> LightZero | None:
-    """Choose the zero with the smaller error, of flicker or of noise."""
+    if found is None:
+        return None
     known = [
         LightZero(one.value / found.level, one.se / found.level, one.value, flickers)
         for one, flickers in ((found.flicker, True), (found.noise, False))
@@ -224,7 +208,6 @@ def zero_of(found: Transfer) -> LightZero | None:
 TOLD = 0.1
 """Error of the zero, as a share of the light, up to which the pixels tell it well enough."""
 
-_LEAST_FRAMES, _LEAST_PIXELS = 16, 256
 _LEAST_UNEVEN, _OVER_LIGHT = 0.03, 2.0  # of the noise, and times that of the light
 _CLEAR = 6.0  # standard errors of what was done to the movie
 _QUANTILE = 0.15866  # of a normal law, one standard deviation below its middle

@@ -11,7 +11,6 @@ from iscat_analysis.diagnosis.calibrated import (
     within,
 )
 from iscat_analysis.diagnosis.causes import (
-    axes_warning,
     fixed_height_warning,
     landing_rate_warning,
     large_warning,
@@ -27,8 +26,7 @@ from iscat_analysis.diagnosis.causes import (
     smear_warning,
     uneven_warning,
 )
-from iscat_analysis.diagnosis.frames import channels_of, without_cut_off
-from iscat_analysis.diagnosis.light import judge_lines
+from iscat_analysis.diagnosis.frames import without_cut_off
 from iscat_analysis.diagnosis.motion import DRIFT_PX, drift_warning, examine_background
 from iscat_analysis.diagnosis.noise import (
     SPECTRUM_FRAMES,
@@ -38,22 +36,15 @@ from iscat_analysis.diagnosis.noise import (
     judge_beside,
     judge_counts,
     judge_window,
-    law_finding,
     survey_over,
 )
 from iscat_analysis.diagnosis.recognise import (
     BLOCK,
-    LARGEST_CHANCE,
-    LEAST_MOVING,
-    MOST_MOVING,
-    MOST_STAYING,
     Changes,
     as_landing,
     as_moving,
     changes_summary,
-    find_changes,
     least_beside,
     look_at_changes,
-    spot_of,
 )
 from iscat_analysis.diagnosis.stretches import Stretches, find_stretches

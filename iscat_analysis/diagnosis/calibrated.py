@@ -44,19 +44,9 @@ from iscat_analysis.diagnosis.recognise import Changes, look_at_changes
 from iscat_analysis.diagnosis.stretches import Stretches, find_stretches
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.findings import Finding, existing, unreported
-from iscat_analysis.findings.camera import (
-    BACKGROUND_WAY,
-    CAMERA_NUMBERS,
-    PATTERN_FOLLOWED,
-    TEMPLATE_BOUNDS,
-)
+from iscat_analysis.findings import camera as of
 from iscat_analysis.findings.files import FILE_IMPLIES
-from iscat_analysis.fitting.ranges import (
-    BackgroundMode,
-    background_mode,
-    describe_background_mode,
-    fitted_frames,
-)
+from iscat_analysis.fitting.ranges import describe_background_mode, fitted_frames
 from iscat_analysis.fitting.run import Notify, notify_nobody
 from iscat_analysis.movie import Stack
 from iscat_analysis.pieces.counts import darkfield_photons
@@ -109,11 +99,6 @@ class Prepared:
     changes: Future[Changes] | None = None
     other_kind: str = ""
     summary: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def background_mode(self) -> BackgroundMode:
-        """Which frames are compared with which."""
-        return background_mode(self.config)
 
     @property
     def tracked(self) -> bool:
@@ -180,8 +165,6 @@ def within(config: Config, frames: tuple[int, int] | None) -> Config:
 Step = Callable[[Prepared], tuple[Prepared, Sequence[Finding | None]]]
 """What is known → what is known after the step, and what it found."""
 
-_FIRST_FRAMES = 64  # frames that are looked at before anything else, fewer of a large field
-
 
 def metadata(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
     """Choose the channel, and take what the file says of the recording."""
@@ -194,14 +177,12 @@ def metadata(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
         *(FILE_IMPLIES({"text": note}) for note in movie.notes),
         *notes,
     ]
-    findings.append(BACKGROUND_WAY({"text": describe_background_mode(config)}))
+    findings.append(of.BACKGROUND_WAY({"text": describe_background_mode(config)}))
     if config.optics.psf == "measured":
-        findings.append(TEMPLATE_BOUNDS())
+        findings.append(of.TEMPLATE_BOUNDS())
     span = fitted_frames(movie, config, config.background.recorded)
-    state = replace(
-        state, stored=movie, whole=movie, movie=movie, steady=movie, config=config, asked=config,
-        stretches=Stretches((span,)),
-    )  # fmt: skip
+    state = replace(state, stored=movie, whole=movie, movie=movie, steady=movie)
+    state = replace(state, config=config, asked=config, stretches=Stretches((span,)))
     return state, findings
 
 
@@ -237,11 +218,9 @@ def camera(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
         findings.append(text_finding(known.text, name))
     findings.append(known.padding(name))
     if state.config.camera.assumed is not state.config.camera:
-        findings.append(CAMERA_NUMBERS({"text": known.description}, where=name))
-    state = replace(
-        state, stored=stored, whole=movie, movie=movie, steady=movie, config=config, known=known,
-        summary={"camera": known.summary},
-    )  # fmt: skip
+        findings.append(of.CAMERA_NUMBERS({"text": known.description}, where=name))
+    state = replace(state, stored=stored, whole=movie, movie=movie, steady=movie)
+    state = replace(state, config=config, known=known, summary={"camera": known.summary})
     return state, findings
 
 
@@ -285,7 +264,7 @@ def light(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
             if config.background.drift_correction == "auto":
                 config = with_drift_correction(config, moves=bool(motion))
             if motion:
-                findings.append(PATTERN_FOLLOWED({"what": motion}, where=name))
+                findings.append(of.PATTERN_FOLLOWED({"what": motion}, where=name))
                 judged, opening, _ = _landing_light(state, config)
         else:
             if follow:  # in the light as it is; again if anything of it is unsteady
@@ -296,10 +275,9 @@ def light(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
         steady = judged.steady
         changes = start_in_thread(look_at_changes, steady, config, state.camera, state.span)
     lines = {} if judged.lines is None else {"lines": judged.lines.summary}
-    state = replace(
-        state, movie=judged.movie, steady=judged.steady, lines=judged.lines, config=config,
-        opening=opening, changes=changes, summary={**state.summary, **lines},
-    )  # fmt: skip
+    state = replace(state, movie=judged.movie, steady=judged.steady, lines=judged.lines)
+    summary = {**state.summary, **lines}
+    state = replace(state, config=config, opening=opening, changes=changes, summary=summary)
     return state, findings
 
 
@@ -333,7 +311,7 @@ def calibrated(
 def _first_frames(state: Prepared) -> tuple[int, int]:
     """Give the few frames that are looked at before anything else."""
     start, stop = state.learned_from
-    return start, max(start, min(stop, start + whole_frames(state.shape, _FIRST_FRAMES)))
+    return start, max(start, min(stop, start + whole_frames(state.shape, 64)))
 
 
 def _landing_light(state: Prepared, config: Config) -> tuple[JudgedLight, NoiseSurvey, str]:

@@ -30,10 +30,6 @@ from iscat_analysis.search.frames import DARK, well_lit
 from iscat_analysis.trust.systematic import is_bent
 from iscat_analysis.units import are, count, frames_listed
 
-FLAT = 0.05
-"""Variance of the steps along z over that in the plane, below which particles move in a plane:
-near the coverslip those that do not have less along z too, but not so much less."""
-
 _DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE, Status.LARGE})
 _ENOUGH_STEPS = 30  # of particles that move, to tell their heights or their blur
 _FEWEST_ROWS, _FEWEST_RESIDUES = 5, 12  # rows of a kind that make it worth a line
@@ -87,12 +83,9 @@ def repeats_warning(movie: Stack, windows: Windows) -> Finding | None:
     if not found:
         return None
     repeat = "repeats" if len(found) == 1 else "repeat"
-    values: dict[str, float | str] = {
-        "frames": frames_listed(found),
-        "of": numbers.size,
-        "repeat": repeat,
-    }
-    return of.FRAMES_REPEATED(values, where=movie.name)
+    return of.FRAMES_REPEATED(
+        {"frames": frames_listed(found), "of": numbers.size, "repeat": repeat}, where=movie.name
+    )
 
 
 def uneven_warning(
@@ -191,10 +184,9 @@ def nonlinearity_warning(scale: MassScale, table: pd.DataFrame) -> Finding | Non
     masses = table["mass_kda"].abs().to_numpy(float)[bent]
     most = float(masses.max())
     share = float(scale.bend(np.array([most]))[0])
-    return of.CONTRAST_NONLINEAR({
-        "particles": count(len(masses), "particle"), "most_kda": most, "are": are(len(masses)),
-        "percent": 100 * abs(share), "way": "light" if share > 0 else "heavy",
-    })  # fmt: skip
+    way = "light" if share > 0 else "heavy"
+    words = {"particles": count(len(masses), "particle"), "are": are(len(masses)), "way": way}
+    return of.CONTRAST_NONLINEAR({**words, "most_kda": most, "percent": 100 * abs(share)})
 
 
 def large_warning(config: Config, table: pd.DataFrame) -> Finding | None:
@@ -212,10 +204,8 @@ def large_warning(config: Config, table: pd.DataFrame) -> Finding | None:
             "fit.spheres; if they are not on the coverslip, use mode size; what is no sphere has "
             f"no diameter{shells}"
         )
-    return of.PARTICLES_LARGE({
-        "particles": count(len(large), "particle"), "of": len(table), "are": are(len(large)),
-        "models": models, "poor": text, "poor_fits": poor,
-    })  # fmt: skip
+    words = {"particles": count(len(large), "particle"), "are": are(len(large)), "models": models}
+    return of.PARTICLES_LARGE({**words, "of": len(table), "poor": text, "poor_fits": poor})
 
 
 def sign_warning(config: Config, table: pd.DataFrame) -> Finding | None:
@@ -227,10 +217,8 @@ def sign_warning(config: Config, table: pd.DataFrame) -> Finding | None:
     brightens = float(table.loc[mass.index, "contrast"].median()) > 0
     change, other = ("brighten", "darken") if brightens else ("darken", "brighten")
     by = "the configured optics" if config.calibration is None else "calibration.gradient_per_kda"
-    particles = count(len(mass), "particle")
-    return of.SIGN_TURNED(
-        {"turned": turned, "particles": particles, "change": change, "other": other, "by": by}
-    )
+    words = {"particles": count(len(mass), "particle"), "change": change, "other": other, "by": by}
+    return of.SIGN_TURNED({"turned": turned, **words})
 
 
 def landing_rate_warning(table: pd.DataFrame) -> Finding | None:
@@ -257,7 +245,8 @@ def fixed_height_warning(config: Config, table: pd.DataFrame) -> Finding | None:
     step = step[next_ones]
     along = float((step["z_nm"] ** 2).median()) / _NORMAL[0]  # outliers change fringes
     across = float((step["x_nm"] ** 2 + step["y_nm"] ** 2).median()) / _NORMAL[1] - noise
-    if along >= FLAT * across:
+    # near the coverslip those that do not move in a plane have less along z too, but not so much
+    if along >= 0.05 * across:
         return None
     values = {"across_nm": math.sqrt(across), "along_nm": math.sqrt(along)}
     return of.HEIGHT_FIXED({**values, "height_nm": float(good["z_nm"].median())})

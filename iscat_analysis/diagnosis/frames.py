@@ -76,10 +76,6 @@ def channels_of(counts: NDArray[Any], camera: Camera) -> int:
     return next(found, 1)
 
 
-_DIM = 0.97
-"""Share of the usual light, below which a part of a frame may be missing."""
-
-
 @dataclass(frozen=True, eq=False)
 class _DarkFramesReplaced(ChangedFrames):
     """A movie in which dark frames are replaced."""
@@ -104,23 +100,16 @@ def without_cut_off(movie: Stack, camera: Camera, windows: Windows) -> tuple[Sta
     usual = float(np.median(power))
     whole = numbers[np.argsort(np.abs(power - usual))[:2]]
     beside = np.concatenate([movie.read(n, n + 1) for n in whole.tolist()])
-    cut = np.array([
-        n
-        for n in numbers[power < _DIM * usual].tolist()
-        if cut_off(np.concatenate([movie.read(n, n + 1), beside]), camera)[0]
-    ], dtype=np.int64)  # fmt: skip
+    dim = numbers[power < 0.97 * usual].tolist()  # a part of which may be missing
+    frames = (np.concatenate([movie.read(n, n + 1), beside]) for n in dim)
+    cut = np.array(dim, dtype=np.int64)[[bool(cut_off(part, camera)[0]) for part in frames]]
     missing = np.union1d(cut, numbers[~well_lit(power, DARK)])
     if not missing.size:
         return movie, None
-    values: dict[str, float | str] = {
-        "frames": frames_listed(missing),
-        "of": numbers.size,
-        "are": are(missing.size),
-    }
-    finding = FRAMES_DARK(values, where=movie.name)
+    words = {"frames": frames_listed(missing), "are": are(missing.size)}
+    finding = FRAMES_DARK({**words, "of": numbers.size}, where=movie.name)
     if cut.size:
-        dark = np.broadcast_to(np.floor(camera.offset_adu), movie.shape[1:]).astype(movie.dtype)
-        movie = movie.seen_as(_DarkFramesReplaced(movie, cut, dark))
+        movie = movie.seen_as(_DarkFramesReplaced(movie, cut, camera.without_light(movie)))
     return movie, finding
 
 
@@ -145,26 +134,23 @@ class KeptFrames:
             return found
         compared, numbers = found.compared, self.numbers
         spans, power = [], []
-        begin = 0
+        rest = compared.power
         for first, last in (compared.frames_before, compared.frames_after):
             kept = numbers[first:last]
             span = (int(kept[0]), int(kept[-1]) + 1) if kept.size else (0, 0)
             light = np.full(span[1] - span[0], np.nan)
-            light[kept - span[0]] = compared.power[begin : begin + kept.size]
-            begin += kept.size
+            light[kept - span[0]], rest = np.split(rest, [kept.size])
             spans.append(span)
             power.append(light)
-        own = found.context.config.model_copy(
-            update={"background": self.configured.background, "fit": self.configured.fit}
-        )
+        asked = {"background": self.configured.background, "fit": self.configured.fit}
+        own = found.context.config.model_copy(update=asked)
         frame = numbers[found.fits["frame"].to_numpy(dtype=np.int64)]
+        compared = replace(
+            compared, frames_before=spans[0], frames_after=spans[1], power=np.concatenate(power)
+        )
+        context = replace(found.context, config=own)
         return replace(
-            found,
-            context=replace(found.context, config=own),
-            fits=found.fits.assign(frame=frame),
-            compared=replace(
-                compared, frames_before=spans[0], frames_after=spans[1], power=np.concatenate(power)
-            ),
+            found, context=context, fits=found.fits.assign(frame=frame), compared=compared
         )
 
 
@@ -186,13 +172,9 @@ def without_repeats(movie: Stack, config: Config, camera: Camera) -> KeptFrames:
         background = background.model_copy(update={"frames": (0, middle)})
     fit = fit.model_copy(update={"frames": (middle, numbers.size)})
     own = config.model_copy(update={"background": background, "fit": fit})
-    repeat = "repeats" if missing.size == 1 else "repeat"
-    values: dict[str, float | str] = {
-        "frames": frames_listed(missing),
-        "of": used.size,
-        "repeat": repeat,
-    }
-    finding = REPEATS_LEFT_OUT({**values, "are": are(missing.size)}, where=movie.name)
+    words = {"repeat": "repeats" if missing.size == 1 else "repeat", "are": are(missing.size)}
+    words["frames"] = frames_listed(missing)
+    finding = REPEATS_LEFT_OUT({**words, "of": used.size}, where=movie.name)
     return KeptFrames(movie.seen_as(StackFrames(movie, numbers)), own, config, numbers, finding)
 
 

@@ -36,9 +36,6 @@ PAIRS = 12
 Half as many tell more of a large field, by the light of all its pixels.
 """
 
-# Every how many-th place in the background is also compared with the frames after it.
-_BACKGROUND_STRIDE = 2
-
 
 class Pair(NamedTuple):
     """Two sets of successive frames, the second a window later than the first."""
@@ -69,7 +66,7 @@ def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
     spot = spot_of(optics.wavelength_nm, optics.na, pixel_nm or optics.wavelength_nm / optics.na)
     odd = find_unsteady(_apart(pairs), camera, least_beside(spot))
     if odd is not None:
-        dark = np.broadcast_to(np.floor(camera.offset_adu), odd.shape)[odd].astype(movie.dtype)
+        dark = camera.without_light(movie)[odd]
         for part in (part for pair in pairs for part in (pair.before, pair.after)):
             part[:, odd] = dark
         movie = movie.without(odd, dark)
@@ -126,30 +123,23 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
     at by themselves, and then some of one with some of the other.  Frames in which particles move
     are compared one by one, half the movie apart: what they have in common is their background.
     """
-    total, pairs_wanted, moving = movie.shape[0], PAIRS, config.background.way == "tracks"
-    large = math.prod(movie.shape[1:]) > LARGEST_PX
-    if large:
-        pairs_wanted //= 2
-    given = config.background.recorded, config.fit.frames
-    frames_each = 8  # that are summed at each place
-    if moving or config.background.slides:
-        first, last = given[1] or (0, total)
-        spans = [(first, min(last, total))]
-        window = config.background.window_frames or longest_window(last - first)
-        if moving:
-            window, frames_each, pairs_wanted = (spans[0][1] - first) // 2, 1, 24
-    else:
-        before = given[0] or (0, 0)
-        first, last = given[1] or (before[1], total)
-        spans = [(before[0], min(before[1], total)), (first, min(last, total))]
-        window = max(stop - start for start, stop in spans)
+    background, moving = config.background, config.background.way == "tracks"
+    total, large = movie.shape[0], math.prod(movie.shape[1:]) > LARGEST_PX
+    before = (0, 0) if moving or background.slides else background.recorded or (0, 0)
+    first, last = config.fit.frames or (before[1], total)
+    spans = [(before[0], min(before[1], total)), (first, min(last, total))]
+    spans = spans[1:] if moving or background.slides else spans
+    window = max(stop - start for start, stop in spans)
+    if background.slides:
+        window = background.window_frames or longest_window(last - first)
+    frames_each, places = 8, PAIRS // (2 if large else 1)  # that are summed at each place
+    if moving:
+        window, frames_each, places = window // 2, 1, 24
     frame_bytes = math.prod(movie.shape[1:]) * np.dtype(movie.dtype).itemsize
-    # frames that tell unsteady pixels, of so few places
+    # frames that tell unsteady pixels, of so few places; and bytes that are read
     fewest = min(3, frames_each) if large else 1
-    # bytes that are read
-    most = min(frames_each, max(96_000_000 // (2 * pairs_wanted * frame_bytes), fewest))
-    pairs_read: list[tuple[int, int]] = []
-    parts: list[NDArray[Any]] = []
+    most = min(frames_each, max(96_000_000 // (2 * places * frame_bytes), fewest))
+    read: list[Pair] = []
     for start, stop in spans:
         gap = min(window, (stop - start) // 2)
         frames_each = min(most, gap, (stop - start - gap) // 3)
@@ -157,30 +147,34 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
             continue
         room = stop - gap - frames_each - start
         # no pair has another's frames
-        number = min(pairs_wanted // len(spans), room // frames_each + 1)
+        number = min(places // len(spans), room // frames_each + 1)
         # half the movie apart, and every second less: what comes again must not be missed
         gaps = (gap, math.ceil(0.62 * gap)) if moving else (gap,)
         for k, frame in enumerate(np.linspace(start, start + room, number).astype(int).tolist()):
-            pairs_read.append((frame, frame + gaps[k % len(gaps)]))
-            parts += [movie.read(k, k + frames_each) for k in pairs_read[-1]]
-    if not parts:
-        return [], window
-    measured = [measure_frames(part, camera) for part in parts]
-    lit = well_lit(np.concatenate([light for light, _ in measured]))  # a shutter may hide a part
-    cuts = np.cumsum([len(part) for part in parts])[:-1]
-    kept = [
-        seen & ~repeats for seen, (_, repeats) in zip(np.split(lit, cuts), measured, strict=True)
-    ]
-    good = [part if used.all() else part[used] for part, used in zip(parts, kept, strict=True)]
-    read = [
-        Pair(frame, before, later, after)
-        for (frame, later), before, after in zip(pairs_read, good[::2], good[1::2], strict=True)
-    ]
+            later = frame + gaps[k % len(gaps)]
+            counts = (movie.read(at, at + frames_each) for at in (frame, later))
+            read.append(Pair(frame, next(counts), later, next(counts)))
+    read = _good(read, camera)
     if len(spans) == 2:
         apart = [p for p in read if p.first >= spans[1][0]]
-        firsts = [p for p in read if p.first < spans[1][0]][-len(apart) :][::_BACKGROUND_STRIDE]
+        firsts = [p for p in read if p.first < spans[1][0]][-len(apart) :]
+        # every second place in the background is also compared with the frames after it
         read += [
             Pair(one.first, one.before, other.later, other.after)
-            for one, other in zip(firsts, apart[::_BACKGROUND_STRIDE], strict=False)
+            for one, other in zip(firsts[::2], apart[::2], strict=False)
         ]
     return [p for p in read if len(p.before) and len(p.after)], window
+
+
+def _good(pairs: Sequence[Pair], camera: Camera) -> list[Pair]:
+    """Leave out frames that repeat or are dark, as behind a shutter."""
+    if not pairs:
+        return []
+    parts = [part for pair in pairs for part in (pair.before, pair.after)]
+    light, repeats = zip(*(measure_frames(part, camera) for part in parts), strict=True)
+    kept = np.split(well_lit(np.concatenate(light)), np.cumsum([len(part) for part in parts])[:-1])
+    good = [part[lit & ~same] for part, lit, same in zip(parts, kept, repeats, strict=True)]
+    return [
+        Pair(pair.first, before, pair.later, after)
+        for pair, before, after in zip(pairs, good[::2], good[1::2], strict=True)
+    ]

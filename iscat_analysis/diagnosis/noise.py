@@ -30,23 +30,12 @@ from iscat_analysis.camera import (
     measure_spectrum,
     shared_light,
     whole_frames,
-    with_pattern_jitter,
     without_pattern_jitter,
 )
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.findings import Finding, existing
-from iscat_analysis.findings.camera import (
-    COUNTS_BENT,
-    COUNTS_BENT_OR,
-    FRAMES_FILTERED,
-    GAIN_BESIDE_OFFSET,
-    OFFSET_OR_GAIN,
-    OFFSET_WRONG,
-    READ_NOISE_LACKING,
-    ROOM_LIGHT,
-    WINDOWS_NOISY,
-)
+from iscat_analysis.findings import camera as of
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, FrameSource, Windows
@@ -88,7 +77,7 @@ def law_finding(known: LearnedCamera, name: str) -> Finding | None:
     share = {"percent": 100 * law.value, "percent_se": 100 * law.se}
     if law.kind == "read noise" and law.value > TOLERANCE:
         lacking = math.sqrt(law.value * known.level_e)
-        return READ_NOISE_LACKING({**share, "lacking_e": lacking}, where=name)
+        return of.READ_NOISE_LACKING({**share, "lacking_e": lacking}, where=name)
     if not (law.bent or (law.kind == "other light" and law.dilutes)):
         return None
     effect = f"{_effect(1 - law.contrast)} (± {100 * law.contrast_se:.2g} %)"
@@ -102,7 +91,7 @@ def law_finding(known: LearnedCamera, name: str) -> Finding | None:
                 f", or set camera.offset_adu = {camera.offset_adu + counts:.5g} and "
                 f"camera.read_noise_e = {read:.4g}, which is its shot noise"
             )
-        return ROOM_LIGHT({**share, "effect": effect, "advice": advice}, where=name)
+        return of.ROOM_LIGHT({**share, "effect": effect, "advice": advice}, where=name)
     both = "the noise and the answer to the laser's power grow"
     grows = both if law.flickers else "the noise grows"
     words = {
@@ -113,10 +102,10 @@ def law_finding(known: LearnedCamera, name: str) -> Finding | None:
     if law.certain:
         more = f" besides an offset of {100 * law.offset:.2g} % of the light" if law.offset else ""
         values = {"grows": grows, "law": f"{words}{more}", "effect": effect}
-        return COUNTS_BENT(values, where=name)
+        return of.COUNTS_BENT(values, where=name)
     others = " or ".join(_OTHERS.get(kind, kind) for kind in law.alike)
     values = {"grows": grows, "law": words, "others": others, "effect": effect}
-    return COUNTS_BENT_OR(values, where=name)
+    return of.COUNTS_BENT_OR(values, where=name)
 
 
 def offset_is_wrong(zero: LightZero, gain: GainDiagnosis) -> bool:
@@ -130,7 +119,6 @@ def offset_is_wrong(zero: LightZero, gain: GainDiagnosis) -> bool:
     if zero.flickers:
         return True
     left = gain.noise_ratio / (1 - zero.share)
-    # of the noise that the light has, with an offset that the noise alone tells
     # of the noise that the light has, with that offset
     return left < 1.1 and not (zero.share > 0 and gain.noise_ratio > 1)
 
@@ -150,9 +138,9 @@ def _effect(share: float) -> str:
 
 def offset_finding(zero: LightZero, camera: Camera) -> Finding:
     """Tell where the light is zero, and what a wrong offset does to masses."""
-    counts = zero.electrons / float(np.mean(camera.gain_e_per_adu))
-    se = zero.se * counts / zero.share
-    found = float(np.mean(camera.offset_adu)) + counts
+    gain, offset = (float(np.mean(v)) for v in (camera.gain_e_per_adu, camera.offset_adu))
+    counts = zero.electrons / gain
+    se, found = zero.se * counts / zero.share, offset + counts
     if np.ndim(camera.offset_adu):
         advice = "record a dark for `iscat calibrate camera --maps`"
     elif found < -SIGMAS * se:  # no camera has its offset below no counts
@@ -163,11 +151,11 @@ def offset_finding(zero: LightZero, camera: Camera) -> Finding:
         missing = math.sqrt(-zero.electrons)
         advice += f" (unless {missing:.3g} e of read noise are missing in camera.read_noise_e)"
     how = "pixels follow the laser's power" if zero.flickers else "the noise grows with the light"
-    return OFFSET_WRONG({
-        "offset": _offset_of(camera), "way": "low" if zero.share > 0 else "high",
-        "counts": abs(counts), "counts_se": se, "how": how, "effect": _effect(zero.share),
-        "advice": advice,
-    })  # fmt: skip
+    numbers = {"counts": abs(counts), "counts_se": se}
+    way = "low" if zero.share > 0 else "high"
+    words = {"offset": _offset_of(camera), "way": way, "how": how, "advice": advice}
+    words["effect"] = _effect(zero.share)
+    return of.OFFSET_WRONG({**numbers, **words})
 
 
 def offset_or_gain_finding(
@@ -185,21 +173,26 @@ def offset_or_gain_finding(
         or (zero is not None and not zero.may_be(share))
     ):
         return None
-    return OFFSET_OR_GAIN({
-        "ratio": gain.noise_ratio, "ratio_se": gain.noise_ratio_se,
-        "measured": gain.gain_e_per_adu, "offset": _offset_of(camera), "effect": _effect(share),
-        "noisy": "by light that is noisy by itself, " if gain.noise_ratio > 1 else "",
-    })  # fmt: skip
+    noisy = "by light that is noisy by itself, " if gain.noise_ratio > 1 else ""
+    words = {"offset": _offset_of(camera), "effect": _effect(share), "noisy": noisy}
+    ratio, measured = gain.noise_ratio, gain.gain_e_per_adu
+    numbers = {"ratio": ratio, "ratio_se": gain.noise_ratio_se, "measured": measured}
+    return of.OFFSET_OR_GAIN({**numbers, **words})
 
 
-def allow_for_correlation(gain: GainDiagnosis, spectrum: NoiseSpectrum | None) -> GainDiagnosis:
-    """Correct the gain for noise that neighbouring pixels share.
+def _judge_gain(
+    counts: NDArray[Any], camera: Camera, masked: BoolArray | None, spectrum: NoiseSpectrum | None
+) -> GainDiagnosis:
+    """Measure the gain, allowing for noise that neighbouring pixels share.
 
     Notes
     -----
     Light is Poisson before charge leaks to neighbours; leaking moves variance into covariances
     (M. Downing et al., Proc. SPIE 6276, 627609, 2006).
+
+    Shapes: `counts` (t, y, x), `masked` (y, x).
     """
+    gain = diagnose_gain(counts[:_GAIN_FRAMES], camera, masked=masked)
     if spectrum is None or not spectrum.correlated:
         return gain
     ratio, error = spectrum.summed
@@ -247,7 +240,6 @@ class Noise:
             return self
         least = float(np.quantile(known, 0.1))  # leave over the noise and no more
         # small pictures leave over as much by chance
-        # small pictures leave over as much by chance
         return Noise() if least < 0.75 * self.excess.ratio else self
 
     @property
@@ -275,27 +267,24 @@ def judge_counts(
     seen, theirs = whole or (counts, camera)
     spectrum = measure_spectrum(seen, theirs, masked=masked)
     try:
-        gain = diagnose_gain(counts[:_GAIN_FRAMES], camera, masked=masked)
+        gain = _judge_gain(counts, camera, masked, spectrum)
     except DataError:  # too dark to tell
         return Noise(spectrum=spectrum)
-    gain = allow_for_correlation(gain, spectrum)
-    gain = with_pattern_jitter(gain, counts[:_GAIN_FRAMES], camera, masked=masked)
     if follows and gain.shakes:
         still = without_pattern_jitter(counts, camera, masked=masked)
         return judge_counts(still, camera, masked=masked, additive=additive, whole=whole)
     shared = shared_light(counts, camera, masked=masked)
-    if shared is not None:
-        return Noise(
-            (FRAMES_FILTERED({"shared": shared}),), True
-        )  # the spectrum is that of neighbours as well
+    if shared is not None:  # the spectrum is that of neighbours as well
+        return Noise((of.FRAMES_FILTERED({"shared": shared}),), True)
+    noisy = gain.off and gain.noise_ratio > 1
     law = camera.law
     if law is not None and (law.bent or law.kind in REPORTED_LAWS):  # already
-        excess = ExcessNoise(gain.noise_ratio, "") if gain.off and gain.noise_ratio > 1 else None
-        return Noise((), gain.off, excess, spectrum)
+        return Noise((), gain.off, ExcessNoise(gain.noise_ratio, "") if noisy else None, spectrum)
+    zero: LightZero | None = None
     if law is not None:
         zero = zero_by_law(law, float(camera.to_electrons(counts[:1]).mean()))
-    else:
-        zero = None if additive else find_zero(counts, camera, masked=masked)
+    elif not additive:
+        zero = find_zero(counts, camera, masked=masked)
     leaks = spectrum is not None and spectrum.correlated
     if zero is not None and leaks and not zero.flickers:
         zero = None  # the variance of a pixel is then of its neighbours' light as well
@@ -309,18 +298,16 @@ def judge_counts(
         follow = ", or set background.drift_correction = true, with which it is followed"
         finding = replace(finding, values={**finding.values, "follow": follow})
     message = "" if finding is None else finding.text
-    excess = ExcessNoise(gain.noise_ratio, message) if gain.off and gain.noise_ratio > 1 else None
+    excess = ExcessNoise(gain.noise_ratio, message) if noisy else None
     if wrong is None:
         return Noise(tuple(existing([finding])), gain.off, excess, spectrum, gain.shakes)
     further: Finding | None = None
-    moved = replace(
-        camera, offset_adu=camera.offset_adu + wrong.electrons / camera.gain_e_per_adu, law=None
-    )
+    offset = camera.offset_adu + wrong.electrons / camera.gain_e_per_adu
+    moved = replace(camera, offset_adu=offset, law=None)
     with contextlib.suppress(DataError):  # too dark to tell
-        rest = diagnose_gain(counts[:_GAIN_FRAMES], moved, masked=masked)
-        rest = allow_for_correlation(rest, measure_spectrum(counts, moved, masked=masked))
-        if rest.finding is not None:
-            further = GAIN_BESIDE_OFFSET({"text": rest.finding.text})
+        spectrum_there = measure_spectrum(counts, moved, masked=masked)
+        rest = _judge_gain(counts, moved, masked, spectrum_there).finding
+        further = rest and of.GAIN_BESIDE_OFFSET({"text": rest.text})
     return Noise(tuple(existing([finding, further])), True, excess, spectrum)
 
 
@@ -367,10 +354,10 @@ def judge_beside(
         if free.any() and free.sum() >= 0.25 * used.sum():  # of the pixels, without particles
             counts = movie.read(span[0], span[0] + count)
             additive = context.additive
-            if judge_counts(counts, camera, masked=~free, additive=additive).findings:
-                counts = camera.to_counts(without(count))
-                return judge_counts(counts, camera, masked=~free, additive=additive)
-            return Noise()
+            if not judge_counts(counts, camera, masked=~free, additive=additive).findings:
+                return Noise()
+            counts = camera.to_counts(without(count))
+            return judge_counts(counts, camera, masked=~free, additive=additive)
         count //= 2
     return Noise()
 
@@ -402,13 +389,13 @@ def survey_noise(reader: Reader, config: Config) -> NoiseSurvey:
             frames = whole_frames(reader.shape, SPECTRUM_FRAMES)
             counts = reader.read(reader.first, min(reader.first + frames, reader.last))
             whole = counts[good_frames(counts, reader.camera)], reader.camera
+        follows = config.background.follows_pattern
         noise = judge_counts(
-            opening, judged.camera, additive=additive,
-            follows=config.background.follows_pattern, whole=whole,
-        )  # fmt: skip
+            opening, judged.camera, additive=additive, follows=follows, whole=whole
+        )
     if noise.excess is None:
         ratio = curve.at(window)
-        message = WINDOWS_NOISY({"window": window, "ratio": ratio}).text
+        message = of.WINDOWS_NOISY({"window": window, "ratio": ratio}).text
         noise = replace(noise, excess=ExcessNoise(ratio, message))
     return NoiseSurvey(reader, noise, curve, window, sample)
 
@@ -437,14 +424,14 @@ def judge_window(reader: Reader, config: Config) -> tuple[NDArray[Any], NoiseCur
     given = config.background.window_frames
     needed = 2 * given if given else SHORTEST_MOVIE
     if frames < needed:
-        windows = (
-            f"two windows of background.window_frames = {given}" if given else "sliding windows"
-        )
+        windows, lower = "sliding windows", ""
+        if given:
+            windows = f"two windows of background.window_frames = {given}"
+            lower = ", or lower background.window_frames"
         raise DataError(
             f"{reader.name}: has {frames} frames, but {windows} before and after each landing take "
-            f"{needed}: record longer"
-            + (", or lower background.window_frames" if given else "")
-            + "; or give the frames before the particles bind as background.frames = [0, N]"
+            f"{needed}: record longer{lower}; or give the frames before the particles bind as "
+            "background.frames = [0, N]"
         )
     opening = reader.opening()
     longest = min(given or longest_window(frames), NOISE_FRAMES // 4)

@@ -37,14 +37,6 @@ from iscat_analysis.search.bright import smoothed, spot_response
 from iscat_analysis.search.frames import summed
 from iscat_analysis.search.peaks import maxima
 
-LEAST_CHANGE_SIGMAS = 12.0
-"""Standard deviations of noise that a change must exceed: the ratios below then have errors of a
-tenth."""
-
-LEAST_STEP_SHARE = 0.15
-"""What the neighbouring differences may come to, as a part of a change that stays, or noise: rings
-of others make less."""
-
 _REACH_SIGMAS = 4.5  # standard deviations of a spot, within which a picture is looked at
 _AROUND = 2  # blocks on either side that are looked at
 _LEAST_BLOCKS = 5
@@ -79,7 +71,8 @@ def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
     size = smooth[3:-1] - smooth[1:-3]
     np.abs(size, out=size)
     apart = round(2 * _REACH_SIGMAS * spot_px)
-    peaks = maxima(size, max(LEAST_CHANGE_SIGMAS * noise, 0.0), (_AROUND, apart, apart))
+    # at twelve standard deviations of noise the ratios below have errors of a tenth
+    peaks = maxima(size, max(12.0 * noise, 0.0), (_AROUND, apart, apart))
     peaks = peaks[_of_spots(blocks, peaks, spot_px)]
     if not len(peaks):
         return NO_CHANGES
@@ -87,7 +80,8 @@ def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
     one, two, _, four, five = (smooth[block + n, *position] for n in range(_LEAST_BLOCKS))
     change = size[block, *position]
     neighbouring = np.maximum(np.abs(two - one), np.abs(five - four)) / change
-    quiet = np.maximum(4.0 * noise / change, LEAST_STEP_SHARE)  # standard deviations
+    # four standard deviations, or a part of a change that stays: rings of others make less
+    quiet = np.maximum(4.0 * noise / change, 0.15)
     pictures = _pictures(smooth, peaks, _REACH_SIGMAS * spot_px, noise)
     staying = (neighbouring < quiet) & (pictures == 1)
     return Changes(len(peaks), float(staying.mean()), float((pictures > 2).mean()))
@@ -145,9 +139,6 @@ def spot_of(wavelength_nm: float, na: float, pixel_nm: float) -> float:
     return max(0.21 * wavelength_nm / na / pixel_nm, 0.5)  # in wavelengths over NA
 
 
-MOST_FRAMES = 2000
-"""Of a movie that are looked at, from its first."""
-
 BLOCK = 20
 """Frames that are averaged: particles on a membrane, 0.15 µm²/s at 331 Hz, go 190 nm in them."""
 
@@ -171,7 +162,7 @@ def look_at_changes(
 ) -> Changes:
     """Find changes in the first frames of a movie, at a sample of the pixels of a large field."""
     movie, camera = sampled(movie, camera)
-    last = min(span[1], span[0] + MOST_FRAMES, movie.shape[0])
+    last = min(span[1], span[0] + 2000, movie.shape[0])
     starts = range(span[0], last - BLOCK + 1, BLOCK)
     # noise is a thousand times what single precision rounds away
     images = np.empty((len(starts), *movie.shape[1:]), dtype=np.float32)

@@ -13,10 +13,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
@@ -92,9 +93,7 @@ class Stretches:
         """What ``summary.json`` says of it."""
         return {
             "analysed": [list(span) for span in self.kept],
-            "breaks": [
-                {"start": one.start, "stop": one.stop, "cause": one.cause} for one in self.breaks
-            ],
+            "breaks": [asdict(one) for one in self.breaks],
         }
 
 
@@ -109,21 +108,17 @@ def find_stretches(
             given[-1] = Break(given[-1].start, max(stop, given[-1].stop), _EXCLUDED)
         elif start < stop:
             given.append(Break(start, stop, _EXCLUDED))
-    if not given:
-        return _breaks_within(movie, span)
     between = _between(span, given)
-    if between is None:
+    if between is None and given:
         raise DataError(
             f"{movie.name}: fit.excluded_frames leaves no {SHORTEST_MOVIE} frames together, which "
             "an analysis needs"
         )
-    parts = [_breaks_within(movie, part) for part in between.kept]
-    breaks = sorted((*given, *(one for part in parts for one in part.breaks)), key=_start_of)
+    parts = [_breaks_within(movie, part) for part in (between.kept if between else [span])]
+    breaks = sorted(
+        (*given, *(one for part in parts for one in part.breaks)), key=lambda b: b.start
+    )
     return Stretches(tuple(kept for part in parts for kept in part.kept), tuple(breaks))
-
-
-def _start_of(one: Break) -> int:
-    return one.start
 
 
 def _breaks_within(movie: Stack, span: tuple[int, int]) -> Stretches:
@@ -143,20 +138,18 @@ def _breaks_within(movie: Stack, span: tuple[int, int]) -> Stretches:
     if not runs or len(runs) > 12:  # beyond which nothing is usual
         return whole
     found: list[Break] = []
-    closed: int | None = None  # since when more light than before
-    for first, last in runs:  # groups between which the light changes
-        one, opens = _break_of(movie, starts, cells, light, (first, last))
-        if opens and closed is None:
-            closed = one.start
+    begun: int | None = None  # since when more light than before
+    for run in runs:  # groups between which the light changes
+        one, opens = _break_of(movie, starts, cells, light, run)
+        if opens:
+            begun = one.start if begun is None else begun
             continue
-        if opens is False and closed is not None:
-            one = Break(closed, max(one.stop, closed + 1), _LAMP)
-            closed = None
-        elif opens is False:
-            one = Break(span[0], one.stop, _LAMP)
+        if opens is False:
+            first = span[0] if begun is None else begun
+            one, begun = Break(first, max(one.stop, first + 1), _LAMP), None
         found.append(one)
-    if closed is not None:
-        found.append(Break(closed, span[1], _LAMP))
+    if begun is not None:
+        found.append(Break(begun, span[1], _LAMP))
     return _between(span, found) or whole
 
 
@@ -229,7 +222,6 @@ def _runs(cells: FloatArray) -> list[tuple[int, int]]:
             last - first >= _LASTING
             and float(share[first:last].max()) > base + _LASTING_SHARE
             # of a few bright particles, one after the other, 0.5
-            # of a few bright particles, one after the other, 0.5
             and float(np.sum(share[first:last] - base)) > 0.8
             # of the pattern's contrast, from one group to the next
             and float(np.median(size)) > 0.05
@@ -273,18 +265,15 @@ def _sudden(movie: Stack, start: int, stop: int) -> int | None:
     """Find the frame at which all of a change is made; None where it takes longer."""
     frames = _cells(movie, start, stop, each=True)
     frames /= frames.mean(axis=(1, 2), keepdims=True)
-    whole = float(np.sum((frames[-_READ:].mean(axis=0) - frames[:_READ].mean(axis=0)) ** 2))
-    sizes = np.array(
-        [
-            np.sum((frames[k : k + _READ].mean(axis=0) - frames[k - _READ : k].mean(axis=0)) ** 2)
-            for k in range(_READ, len(frames) - _READ + 1)
-        ]
-    )
-    if not sizes.size or whole <= 0:
-        return None
     # of the four frames on either side none has a part of the change, if it is sudden
-    best = int(np.argmax([
-        np.sum((frames[k] - frames[k - 1]) ** 2) for k in range(_READ, len(frames) - _READ + 1)
-    ]))  # fmt: skip
-    # of the change, which one frame makes
-    return start + _READ + best if sizes[best] > 0.7 * whole else None
+    means = sliding_window_view(frames, _READ, axis=0).mean(axis=-1)
+    sizes, whole = _squares(means[_READ:] - means[:-_READ]), _squares(means[-1:] - means[:1])
+    if not sizes.size or whole[0] <= 0:
+        return None
+    best = int(np.argmax(_squares(np.diff(frames, axis=0))[_READ - 1 : 1 - _READ]))
+    return start + _READ + best if sizes[best] > 0.7 * whole[0] else None
+
+
+def _squares(changes: FloatArray) -> FloatArray:
+    """Sum the squares of each of some images (n, y, x)."""
+    return np.asarray(np.sum(np.square(changes), axis=(1, 2)))

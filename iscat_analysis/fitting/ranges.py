@@ -142,10 +142,7 @@ def measured_windows(
         for number in np.flatnonzero(whole).tolist():
             refuse(counts[number : number + 1], first + number)
 
+    checks = check if config.optics.interferes else refuse
     return measure_windows(
-        movie, camera, before, after,
-        median=not (background.is_counted or background.is_known), level_e=background.level_e,
-        overlap=background.learnt_with_tracks,
-        power_normalization=background.power_normalization,
-        check=check if config.optics.interferes else refuse, progress=progress,
-    )  # fmt: skip
+        movie, camera, before, after, background, check=checks, progress=progress
+    )

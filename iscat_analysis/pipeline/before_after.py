@@ -15,6 +15,7 @@ import pandas as pd
 
 from iscat_analysis import diagnosis
 from iscat_analysis.camera import measure_windows, refine_power, start_power
+from iscat_analysis.config import BackgroundConfig
 from iscat_analysis.diagnosis import Noise, Prepared
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.camera import MODEL_MISFITS
@@ -232,10 +233,9 @@ class BeforeAfterSearch:
         context, known = self._context, self._windows
         frame = int(np.searchsorted(self._numbers, frame))
         frame = min(max(frame, self._after[0]), self._after[1] - window)
-        part = measure_windows(
-            self._movie, self._camera, None, (frame, frame + window),
-            level_e=1.0, power_normalization=False, check=self._check,
-        )  # fmt: skip
+        one = BackgroundConfig(method="known", level_e=1.0, power_normalization=False)
+        span = frame, frame + window
+        part = measure_windows(self._movie, self._camera, None, span, one, check=self._check)
         windows = replace(
             known,
             after_e=part.after_e,

@@ -8,15 +8,14 @@ from scenes import Stack
 from scipy.ndimage import median_filter
 
 from iscat_analysis.camera import (
-    DEAD,
-    DEFECT_SIGMAS,
-    HOT,
     Camera,
     find_defects,
     measure_windows,
     refine_power,
     smooth_background,
 )
+from iscat_analysis.camera.moments import DEAD, DEFECT_SIGMAS, HOT
+from iscat_analysis.config import BackgroundConfig
 from iscat_analysis.errors import DataError
 
 SHAPE = (48, 56)
@@ -48,6 +47,10 @@ def _movie(
 
 
 BEFORE, AFTER = (0, 30), (30, 50)
+AS_IT_IS = {"power_normalization": False}
+MEAN = BackgroundConfig(method="fixed")
+MEDIAN = BackgroundConfig(method="median")
+KNOWN = BackgroundConfig(method="known", level_e=2e3)
 
 
 def test_sums_are_plain_sums() -> None:
@@ -132,7 +135,7 @@ def test_with_the_particles_explained_the_ratio_is_unbiased(depth: float) -> Non
 
 def test_without_normalisation_the_frames_are_counted() -> None:
     stack, _ = _movie(0)
-    windows = measure_windows(stack, Camera(), BEFORE, AFTER, power_normalization=False)
+    windows = measure_windows(stack, Camera(), BEFORE, AFTER, MEAN.model_copy(update=AS_IT_IS))
     assert windows.power_ratio == 20 / 30
 
 
@@ -143,7 +146,9 @@ def test_the_median_forgets_a_visitor() -> None:
     stack, _ = _movie(4, power_noise=0.0)
     stack.counts[5:11, 20:24, 20:24] *= 3
     camera = Camera(offset_adu=7.0)
-    windows = measure_windows(stack, camera, BEFORE, AFTER, median=True, power_normalization=False)
+    windows = measure_windows(
+        stack, camera, BEFORE, AFTER, MEDIAN.model_copy(update={"power_normalization": False})
+    )
     expected = 30 * (np.median(stack.counts[:30], axis=0) - 7.0)
     np.testing.assert_allclose(windows.before_e, expected)
     mean = measure_windows(stack, camera, BEFORE, AFTER)
@@ -154,7 +159,7 @@ def test_the_median_forgets_a_visitor() -> None:
 def test_the_median_scatters_as_a_median_of_shot_noise(power_noise: float) -> None:
     """Whatever the laser does: variance π/2 times that of the mean, and no bias."""
     stack, power = _movie(5, power_noise=power_noise)
-    windows = measure_windows(stack, Camera(), BEFORE, AFTER, median=True)
+    windows = measure_windows(stack, Camera(), BEFORE, AFTER, MEDIAN)
     light = 2e3 * np.random.default_rng(2).uniform(0.7, 1.3, SHAPE) * power[:30].sum()
     pulls = (windows.before_e - light) / np.sqrt(light * np.pi / 2)
     # The median of 30 is not yet that of infinitely many: 2 % less.
@@ -164,14 +169,16 @@ def test_the_median_scatters_as_a_median_of_shot_noise(power_noise: float) -> No
 
 def test_a_known_background_needs_no_frames() -> None:
     stack, _ = _movie(5, power_noise=0.02)
-    windows = measure_windows(stack, Camera(), None, AFTER, level_e=2e3)
+    windows = measure_windows(stack, Camera(), None, AFTER, KNOWN)
     assert windows.n_before == 0
     assert windows.frames_before == (0, 0)
     np.testing.assert_array_equal(windows.before_e, 2e3)
     total = windows.after_e.sum()
     expected = total / (2e3 * np.prod(SHAPE))
     assert windows.power_ratio == pytest.approx(expected, rel=0.02)
-    fixed = measure_windows(stack, Camera(), None, AFTER, level_e=2e3, power_normalization=False)
+    fixed = measure_windows(
+        stack, Camera(), None, AFTER, KNOWN.model_copy(update={"power_normalization": False})
+    )
     assert fixed.power_ratio == 20
     assert windows.power.size == 20
 

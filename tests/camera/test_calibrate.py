@@ -35,13 +35,11 @@ def test_electrons() -> None:
     assert electrons.dtype == np.float64
     np.testing.assert_array_equal(electrons, [[[0, 10], [-25, 163587.5]]])
     assert counts[0, 0, 1] == 104
-
-
-def test_electrons_with_maps() -> None:
     gain, offset = np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([[0.0, 1.0], [2.0, 3.0]])
-    camera = Camera(gain_e_per_adu=gain, offset_adu=offset)
-    counts = np.full((3, 2, 2), 5.0)
-    np.testing.assert_array_equal(camera.to_electrons(counts), [[[5, 8], [9, 8]]] * 3)
+    maps = Camera(gain_e_per_adu=gain, offset_adu=offset)
+    np.testing.assert_array_equal(
+        maps.to_electrons(np.full((3, 2, 2), 5.0)), [[[5, 8], [9, 8]]] * 3
+    )
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ from scipy.ndimage import fourier_shift, gaussian_filter
 from wanderers import SETTINGS, wander
 
 import iscat_analysis as ia
-from iscat_analysis.camera import Camera, LightModel, Seams, Smooth, find_light
+from iscat_analysis.camera import Camera, LightModel, find_light
+from iscat_analysis.camera.light import Seams, Smooth
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.study import Movie

@@ -13,7 +13,7 @@ from scipy.stats import poisson
 import iscat_analysis as ia
 from iscat_analysis.camera import LightModel
 from iscat_analysis.config import Config, load_config
-from iscat_analysis.diagnosis import judge_lines
+from iscat_analysis.diagnosis.light import judge_lines
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.study import Movie

@@ -10,7 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 import iscat_analysis as ia
-from iscat_analysis.camera import Camera, converter_ceiling, learn_camera, padded_bits
+from iscat_analysis.camera import Camera
+from iscat_analysis.camera.counts import converter_ceiling, padded_bits
+from iscat_analysis.camera.learned import learn_camera
 from iscat_analysis.config import CameraConfig
 from iscat_analysis.records import StackMetadata
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,62 +67,47 @@ def check_pulls(pulls: list[list[float]]) -> None:
     assert np.all(table.std(axis=0, ddof=1) > 0.35), table.std(axis=0)
 
 
-def test_a_dark_and_a_movie_give_the_camera() -> None:
+def _dark(rng: np.random.Generator) -> CameraCalibration:
+    light = context(rng)
+    return measure_camera([record(light, 120, rng)], dark=record(0 * light, 80, rng))
+
+
+def _flicker(rng: np.random.Generator) -> CameraCalibration:
+    return measure_camera([record(context(rng), 200, rng, power=0.05, read_e=60.0)])
+
+
+def _levels(rng: np.random.Generator) -> CameraCalibration:
+    light = context(rng)
+    return measure_camera([record(f * light, 60, rng, power=0.0) for f in (0.2, 0.6, 1.0)])
+
+
+def _steady(rng: np.random.Generator) -> CameraCalibration:
+    found = measure_camera([record(context(rng), 200, rng, power=0.0)])
+    assert found.read_noise_e is None
+    assert any("cannot be told apart" in note for note in found.notes)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("recorded", "source", "offset", "read_e", "first"),
+    [
+        (_dark, "dark", OFFSET, READ_WITH_ROUNDING_E, 0),
+        (_flicker, "flicker", OFFSET, math.hypot(60.0, GAIN / math.sqrt(12)), 100),
+        (_levels, "flicker", OFFSET, None, 200),
+        (_steady, "line", OFFSET - READ_WITH_ROUNDING_E**2 / GAIN, None, 300),
+    ],
+)
+def test_recordings_give_the_camera_with_its_errors(
+    recorded: Callable[[np.random.Generator], CameraCalibration], source: str, offset: float,
+    read_e: float | None, first: int,
+) -> None:  # fmt: skip
+    """As far as they tell it: a steady laser leaves only where the line ends."""
     pulls = []
-    for seed in range(SEEDS):
-        rng = np.random.default_rng(seed)
-        light = context(rng)
-        found = measure_camera([record(light, 120, rng)], dark=record(0 * light, 80, rng))
-        pulls.append(
-            [
-                pull(found.gain_e_per_adu, GAIN),
-                pull(found.offset_adu, OFFSET),
-                pull(found.read_noise_e, READ_WITH_ROUNDING_E),
-            ]
-        )
-        assert found.offset_from == "dark"
-    check_pulls(pulls)
-
-
-def test_a_flickering_laser_gives_the_offset_without_a_dark() -> None:
-    pulls = []
-    for seed in range(SEEDS):
-        rng = np.random.default_rng(100 + seed)
-        found = measure_camera([record(context(rng), 200, rng, power=0.05, read_e=60.0)])
-        assert found.offset_from == "flicker"
-        truth = math.hypot(60.0, GAIN / math.sqrt(12))
-        pulls.append(
-            [
-                pull(found.gain_e_per_adu, GAIN),
-                pull(found.offset_adu, OFFSET),
-                pull(found.read_noise_e, truth),
-            ]
-        )
-    check_pulls(pulls)
-
-
-def test_levels_of_one_scene_give_the_offset() -> None:
-    pulls = []
-    for seed in range(SEEDS):
-        rng = np.random.default_rng(200 + seed)
-        light = context(rng)
-        stacks = [record(f * light, 60, rng, power=0.0) for f in (0.2, 0.6, 1.0)]
-        found = measure_camera(stacks)
-        assert found.offset_from == "flicker"
-        pulls.append([pull(found.gain_e_per_adu, GAIN), pull(found.offset_adu, OFFSET)])
-    check_pulls(pulls)
-
-
-def test_a_steady_laser_leaves_only_where_the_line_ends() -> None:
-    pulls = []
-    for seed in range(SEEDS):
-        rng = np.random.default_rng(300 + seed)
-        found = measure_camera([record(context(rng), 200, rng, power=0.0)])
-        assert found.offset_from == "line"
-        assert found.read_noise_e is None
-        assert any("cannot be told apart" in note for note in found.notes)
-        end = OFFSET - READ_WITH_ROUNDING_E**2 / GAIN
-        pulls.append([pull(found.gain_e_per_adu, GAIN), pull(found.offset_adu, end)])
+    for seed in range(first, first + SEEDS):
+        found = recorded(np.random.default_rng(seed))
+        assert found.offset_from == source
+        pulls.append([pull(found.gain_e_per_adu, GAIN), pull(found.offset_adu, offset)])
+        pulls[-1] += [] if read_e is None else [pull(found.read_noise_e, read_e)]
     check_pulls(pulls)
 
 
@@ -265,13 +251,9 @@ def test_maps_show_pixels_that_differ() -> None:
         measure_camera([Movie(movie.counts[:50])], dark=dark, maps=True)
 
 
-def verdict_of(movie: Movie) -> CameraCalibration:
-    return measure_camera([movie], offset_adu=OFFSET)
-
-
 def test_noise_falls_as_shot_noise_does() -> None:
     rng = np.random.default_rng(7)
-    found = verdict_of(record(context(rng), 512, rng, read_e=5.0))
+    found = measure_camera([record(context(rng), 512, rng, read_e=5.0)], offset_adu=OFFSET)
     noise = found.noise
     assert found.shot_limited_frames == noise["n_frames"].max() == 256
     assert np.all(np.abs(noise["excess"] - 1) < 5 * noise["excess_se"] + 0.01)
@@ -287,7 +269,7 @@ def test_drift_ends_the_shot_noise_limit() -> None:
         [record(np.roll(light, k // 64, axis=1), 1, rng, read_e=5.0).counts for k in range(512)]
     )
     # Every 64 frames the speckle moves by one pixel.
-    found = verdict_of(Movie(counts))
+    found = measure_camera([Movie(counts)], offset_adu=OFFSET)
     assert found.shot_limited_frames is not None
     assert 2 <= found.shot_limited_frames <= 64
     assert "drift" in found.verdict

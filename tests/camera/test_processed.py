@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter, median_filter, shift
 
 from iscat_analysis.camera import Camera, find_processing
 
-FRAMES, SIDE, GAIN = 300, 96, 4.0
+FRAMES, SIDE, GAIN = 150, 96, 4.0
 
 Movie = NDArray[np.float64]
 
@@ -100,7 +100,7 @@ def test_what_leaves_the_noise_of_pixels_alone_is_no_processing(
     assert kind(change(raw(7, laser=0.1))) is None
 
 
-@pytest.mark.parametrize("px_per_frame", [0.001, 0.002, 0.01, 0.3])
+@pytest.mark.parametrize("px_per_frame", [0.002, 0.004, 0.02, 0.3])
 def test_a_movie_that_was_aligned_is_interpolated(px_per_frame: float) -> None:
     assert kind(aligned(raw(2), px_per_frame)) == "interpolated"
 

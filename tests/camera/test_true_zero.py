@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from iscat_analysis.camera import LearnedCamera, learn_camera, with_camera
+from iscat_analysis.camera import LearnedCamera, with_camera
+from iscat_analysis.camera.learned import learn_camera
 from iscat_analysis.config import CameraConfig, parse_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack

@@ -77,7 +77,7 @@ def test_an_uneven_field_over_a_known_level_is_named(
 
 @pytest.mark.parametrize("kind", ["even", "heavy"])
 def test_rings_of_particles_are_not_called_uneven(movies: dict[str, Path], kind: str) -> None:
-    assert not _said(movies[kind], KNOWN)
+    assert not _said(movies[kind], KNOWN | DIPOLES)
 
 
 def test_what_a_wrong_focus_leaves_over_is_not_called_uneven(movies: dict[str, Path]) -> None:

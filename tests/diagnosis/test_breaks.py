@@ -12,9 +12,11 @@ from scenes import make_config
 from scipy.ndimage import fourier_shift
 
 import iscat_analysis as ia
-from iscat_analysis.camera import Camera, boxes_of, check_counts, find_text
+from iscat_analysis.camera import Camera, check_counts
+from iscat_analysis.camera.pixels import boxes_of, find_text
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis import channels_of, find_stretches
+from iscat_analysis.diagnosis import find_stretches
+from iscat_analysis.diagnosis.frames import channels_of
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline.finish import look_at

@@ -58,9 +58,10 @@ def wholes() -> dict[str, ia.Result]:
     }
 
 
-@pytest.mark.parametrize("way", ["fixed", "sliding"])
-@pytest.mark.parametrize("filled", [0, OFFSET])
-@pytest.mark.parametrize("number", [20, 60])
+@pytest.mark.parametrize(
+    ("way", "filled", "number"),
+    [("fixed", 0, 20), ("fixed", OFFSET, 60), ("sliding", OFFSET, 20), ("sliding", 0, 60)],
+)
 def test_half_a_frame_is_left_out_of_sums(
     way: str, filled: int, number: int, wholes: dict[str, ia.Result]
 ) -> None:

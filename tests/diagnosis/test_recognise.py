@@ -12,17 +12,13 @@ from wanderers import wander
 
 from iscat_analysis import fit_movie
 from iscat_analysis.camera import Camera, camera_from_config
-from iscat_analysis.diagnosis import (
-    BLOCK,
+from iscat_analysis.diagnosis import BLOCK, Changes, as_landing, as_moving, look_at_changes
+from iscat_analysis.diagnosis.recognise import (
     LARGEST_CHANCE,
     LEAST_MOVING,
     MOST_MOVING,
     MOST_STAYING,
-    Changes,
-    as_landing,
-    as_moving,
     find_changes,
-    look_at_changes,
     spot_of,
 )
 from iscat_analysis.errors import DataError, FloodError

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from small_files import refused
 from tiff_files import ASCII, RATIONAL, SHORT, movie, write_micro_manager, write_pages
 
-from iscat_analysis.camera import learn_camera, resolve_metadata
+from iscat_analysis.camera import resolve_metadata
+from iscat_analysis.camera.learned import learn_camera
 from iscat_analysis.config import CameraConfig, configure
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import measure_clock, open_stack
