@@ -260,14 +260,6 @@ class MergedChunks:
         """Which part of field and time was searched."""
         return Searched.joined([d.searched for d in self._done if d.searched is not None])
 
-    def _opens(self, number: int) -> bool:
-        """Whether a stretch begins with this chunk."""
-        return number == 0 or self._closes(self._done[number - 1])
-
-    def _closes(self, done: FinishedChunk) -> bool:
-        """Whether a stretch ends with this chunk."""
-        return done.core[1] in self._ends
-
     def _in_place(self, values: Sequence[NDArray[Any]], between: Any) -> NDArray[Any]:
         """Put what each chunk says of its frames in their order, and something between stretches.
 
@@ -295,8 +287,7 @@ class MergedChunks:
         parts: list[Trajectory] = []
         way: Trajectory | None = None  # the chunk before, halo included
         for done in self._done:
-            part = done.trajectory
-            if part is None:
+            if (part := done.trajectory) is None:
                 continue
             if way is not None:
                 common = part.frames <= way.frames[-1]
@@ -328,8 +319,9 @@ class MergedChunks:
         way = self.trajectory()
         if way is not None:
             return [float(d) for d in way.shift_px[-1]]
-        first = [done for k, done in enumerate(self._done) if self._opens(k)]
-        last = [done for done in self._done[:-1] if self._closes(done)] + self._done[-1:]
+        closed = [done.core[1] in self._ends for done in self._done[:-1]]  # stretches
+        first = list(compress(self._done, [True, *closed]))
+        last = [*compress(self._done, closed), self._done[-1]]
         if last[-1].ends_e.size == 0:  # it was interrupted in the middle of a stretch
             return None
         # of the middle of the field, whose drift is measured

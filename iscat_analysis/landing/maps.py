@@ -244,12 +244,10 @@ class Searched:
     @classmethod
     def joined(cls, parts: Sequence[Searched]) -> Searched:
         """Put chunks together."""
-        if not parts:
-            return cls(np.empty(0, dtype=np.int64), np.empty((0, LEVELS.size)))
-        return cls(
-            np.concatenate([part.frames for part in parts]),
-            np.concatenate([part.shares for part in parts]),
-        )
+        nothing = cls(np.empty(0, dtype=np.int64), np.empty((0, LEVELS.size)))
+        parts = [nothing, *parts]
+        frames = np.concatenate([part.frames for part in parts])
+        return cls(frames, np.concatenate([part.shares for part in parts]))
 
     def summary(self, snr: float, threshold: float, stride: int) -> dict[str, Any]:
         """Say what part was searched for particles of a signal-to-noise ratio."""

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.addresses import MARK, path_beside, setup_beside, split_address
+from iscat_analysis.movie.arrays import MappedFrames, bytes_are_swapped
 from iscat_analysis.movie.descriptions import measure_clock
 from iscat_analysis.movie.formats import (
     FORMATS,
@@ -27,7 +28,6 @@ from iscat_analysis.movie.formats import (
     open_file,
 )
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
-from iscat_analysis.movie.plain import MappedFrames, bytes_are_swapped
 from iscat_analysis.movie.stack import (
     ArrayFrames,
     ArrayLike,

@@ -13,25 +13,23 @@ from typing import NamedTuple, NoReturn
 from iscat_analysis.errors import DataError
 from iscat_analysis.hashing import refuse_changed, states_of
 from iscat_analysis.movie.addresses import MARK, split_address
-from iscat_analysis.movie.containers import (
+from iscat_analysis.movie.arrays import (
+    NPY_SIGNATURE,
     arrays_of_mat,
     arrays_of_npz,
+    description_of,
     holds_one,
     is_matlab_hdf5,
     open_member,
-)
-from iscat_analysis.movie.descriptions import with_side_files
-from iscat_analysis.movie.mapped import HDF5_SIGNATURE, Writer, writer_of
-from iscat_analysis.movie.microscopes import needed_package, open_czi, open_nd2
-from iscat_analysis.movie.plain import (
-    NPY_SIGNATURE,
-    description_of,
     open_npy,
     open_raw,
     open_recorded,
     recorded_files,
 )
-from iscat_analysis.movie.plain import SUFFIXES as RECORDED
+from iscat_analysis.movie.arrays import SUFFIXES as RECORDED
+from iscat_analysis.movie.descriptions import with_side_files
+from iscat_analysis.movie.mapped import HDF5_SIGNATURE, Writer, writer_of
+from iscat_analysis.movie.microscopes import needed_package, open_czi, open_nd2
 from iscat_analysis.movie.stack import Frames, Stack, single_frame
 from iscat_analysis.movie.tiff import (
     TIFF_SUFFIXES,

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
-from iscat_analysis.movie.containers import name_one
+from iscat_analysis.movie.arrays import name_one
 from iscat_analysis.movie.descriptions import Hints, merge, positive
 from iscat_analysis.movie.mapped import (
     HARMLESS_BYTES,
