@@ -26,7 +26,7 @@ from iscat_analysis.fitting.ranges import background_mode
 from iscat_analysis.fitting.run import Run, partial_folder
 from iscat_analysis.landing import chunks as chunk_work
 from iscat_analysis.landing.chunks import FinishedChunk, MergedChunks
-from iscat_analysis.landing.find import analyse_landings, drift_findings
+from iscat_analysis.landing.find import analyse_landings, drift_findings, frame_findings
 from iscat_analysis.landing.steps import ChunkFitter
 from iscat_analysis.landing.tasks import TaskBuilder
 from iscat_analysis.movie import open_stack
@@ -820,3 +820,15 @@ def test_injection_needs_sliding_windows(movie: Path) -> None:
     config = _config("background.frames=[0, 60]", "posterior.enabled=false")
     with open_stack(movie) as stack, pytest.raises(ConfigError, match="`inject` = "):
         analyse(stack, config, Run(inject=8))
+
+
+@pytest.mark.parametrize(("missing", "lost"), [(3, ""), (400, "67% of the movie")])
+def test_frames_left_out_are_told_with_what_is_lost(missing: int, lost: str) -> None:
+    """A pixel that is NaN in two thirds of the frames costs two thirds of the landings."""
+    light = np.full(600, 1e4)
+    light[200 : 200 + missing] = np.nan
+    (found,) = frame_findings("m.tif", np.arange(200, 200 + missing), light, 0)
+    said = found.text
+    assert said.startswith("m.tif: frames 200, 201, 202")
+    assert ("lost" in said) == bool(lost)
+    assert lost in said
