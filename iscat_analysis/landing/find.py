@@ -44,15 +44,6 @@ from iscat_analysis.search.sliding import boundaries, stride_of
 from iscat_analysis.threads import start_in_thread
 from iscat_analysis.units import are, frames_listed, listed
 
-JUMP = 0.1
-"""Relative change of the light from one frame to the next that is reported."""
-
-LOST = 0.05
-"""Share of the frames that may be left out without a word on what is missed by it."""
-
-LEAST_SHARE = 0.95
-"""Share of field and time that is searched, below which it is said in words."""
-
 
 def find_landings(ready: Prepared, run: Run) -> DetectionResult:
     """Find what lands or leaves between windows that slide over a movie."""
@@ -209,7 +200,7 @@ def landing_findings(
     follows = config.background.follows_pattern
     yield from drift_findings(name, merged, windows, corrected=follows)
     share = summary["searched_share"]
-    if share is not None and share < LEAST_SHARE:
+    if share is not None and share < 0.95:
         spans = sorted(summary["partly_searched"], key=lambda span: span[2])[:3]
         worst = ", ".join(f"{start}:{stop} ({part:.0%})" for start, stop, part in sorted(spans))
         values = {"share": share, "snr": summary["searched_snr"], "frames": worst}
@@ -233,13 +224,13 @@ def frame_findings(
     if missing.size:
         share = missing.size / light.size
         values = {"frames": frames_listed(missing), "verb": are(missing.size), "lost": ""}
-        if share > LOST:
+        if share > 0.05:
             values["lost"] = f"; {share:.0%} of the movie, with what lands there, is lost"
         yield of.FRAMES_LEFT_OUT({**values, "number": missing.size}, where=name)
     known = np.flatnonzero(np.isfinite(light))
     change = light[known][1:] / light[known][:-1] - 1
     usual = robust_sigma(change) if change.size else 0.0
-    jumps = known[1:][np.abs(change) > max(JUMP, 8 * usual)] + first
+    jumps = known[1:][np.abs(change) > max(0.1, 8 * usual)] + first
     if jumps.size:
         largest = 100 * float(change[np.argmax(np.abs(change))])
         yield of.BRIGHTNESS_JUMPS({"frames": frames_listed(jumps), "percent": largest}, where=name)

@@ -227,9 +227,6 @@ class SidelobeFilter:
 LEVELS = np.geomspace(1.0, 64.0, 25)
 """Signal-to-noise ratios, in thresholds, at which the share of the places is kept."""
 
-_RING_STEP_PX = 4.0
-_WHOLE = 0.999  # share from which a boundary counts as searched
-
 
 @dataclass(frozen=True)
 class Searched:
@@ -258,7 +255,7 @@ class Searched:
             zip(self.frames.tolist(), share.round(3).tolist(), strict=True), lambda each: each[1]
         ):
             held = [frame for frame, _ in run]
-            if value < _WHOLE:
+            if value < 0.999:
                 half = stride // 2
                 spans.append([max(held[0] - half, 0), held[-1] - half + stride, value])
         return {
@@ -322,7 +319,7 @@ def _raise_near_fitted(
     centre = step.start.x_px, step.start.y_px
     y, x = (np.arange(n) - c for n, c in zip(asked.shape, centre[::-1], strict=True))
     away = np.hypot(y[:, None], x[None, :])
-    radii = np.arange(_RING_STEP_PX, LARGEST_IMAGE * roi_px + _RING_STEP_PX, _RING_STEP_PX)
+    radii = np.arange(4.0, LARGEST_IMAGE * roi_px + 4.0, 4.0)
     rings = [EXCEEDS * size_on_ring(snr, centre, (centre[0] + r, centre[1])) for r in radii]
     left = np.interp(away, radii, rings, right=0.0)
     np.maximum(left, np.where(away < roi_px / 2, inside, 0.0), out=left)

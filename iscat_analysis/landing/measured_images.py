@@ -39,9 +39,6 @@ from iscat_analysis.search.frames import Chunk
 from iscat_analysis.search.peaks import RINGS, chi2_excess, summits
 from iscat_analysis.search.sliding import STRIDES
 
-_OUTLIER_SIGMAS = 3.0  # standard deviations from which a pixel counts less
-_PASSES = 2  # over steps whose pictures overlap
-_LITTLE, _MUCH = 0.1, 4.0  # χ² in excess over what the fit explains
 _LEAST_MISFIT_SHARE = 0.1  # share of a misfit that alone passes the threshold where it hides others
 # Farthest that the centre may lie from the fit of the model, in sides of the region.
 _LARGEST_SHIFT_SHARE = 0.35
@@ -147,7 +144,7 @@ def with_measured_images(
         elif not middle.is_measured:
             lobes.add(i)
     measured = list(steps)
-    for _ in range(_PASSES):
+    for _ in range(2):  # since pictures overlap
         for i in chosen:
             others = [measured[k] for k in near[i] if k not in lobes]
             measured[i] = _measured(measured[i], others, neighbours)
@@ -163,10 +160,10 @@ def _hides_others(step: Step, threshold: float, *, sphere: bool) -> bool:
     """
     if sphere:
         return step.excess > (threshold / _LEAST_MISFIT_SHARE) ** 2
-    described = step.excess < _LITTLE * step.snr**2
+    described = step.excess < 0.1 * step.snr**2
     if described and RINGS * step.start.snr > threshold:
         return True
-    return step.excess > max(_MUCH * step.snr**2, (threshold / _LEAST_MISFIT_SHARE) ** 2)
+    return step.excess > max(4 * step.snr**2, (threshold / _LEAST_MISFIT_SHARE) ** 2)
 
 
 def _is_lobe(step: Step, brighter: Step, neighbours: Neighbours) -> bool:
@@ -271,5 +268,5 @@ def ring_average(
         image = design @ spsolve(normal.tocsc(), design.T @ (kept * value))
         off = np.abs(value - image) * accuracy
         scale = max(1.0, float(np.median(off[accuracy > 0])) / 0.6745)
-        kept = accuracy**2 * np.minimum(1.0, _OUTLIER_SIGMAS * scale / np.maximum(off, 1e-9)) ** 2
+        kept = accuracy**2 * np.minimum(1.0, 3 * scale / np.maximum(off, 1e-9)) ** 2
     return np.asarray(image.reshape(contrast.shape))

@@ -29,9 +29,6 @@ from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.frames import EVERYWHERE, Box, Chunk, middle_of_box
 from iscat_analysis.trust.null_field import background_field, empty_field, taken_by, taken_places
 
-PLACES, MOVIE_PLACES = 20_000, 100_000
-"""Places times windows at which the noise of a chunk is looked at, and of a whole movie."""
-
 
 def nothing_repeated(mode: str) -> FloatArray:
     """Give the record of an event whose frames could not be divided."""
@@ -154,8 +151,11 @@ def step_controls(
 
 
 def most_windows(places: int, share: float) -> int:
-    """Give the number of such windows in a chunk, in proportion to its share of the movie."""
-    enough = min(PLACES, MOVIE_PLACES * share) / max(places, 1)
+    """Give the number of such windows in a chunk, in proportion to its share of the movie.
+
+    The noise of a chunk is looked at in so many places times windows, and that of a whole movie.
+    """
+    enough = min(20_000, 100_000 * share) / max(places, 1)
     return int(np.clip(enough, 2, 8))
 
 

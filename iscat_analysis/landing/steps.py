@@ -49,14 +49,9 @@ from iscat_analysis.search.peaks import Described, chi2_excess
 from iscat_analysis.search.sliding import MapArray, Peak, find_steps, make_filter
 from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, refuse_flood
 
-ROUNDS = 10
-"""Searches at most; each takes what was found so far off the contrast."""
-
-_SWEEPS = 10  # fits of what has neighbours that still move, with everything else in place
 # Of the threshold; a fit that reaches less is what other steps explain
 _LEAST_THRESHOLD_SHARE = 0.7
 _SAME_PX = 1.5
-_LEAST_MASS_RATIO = 5.0  # times the mass of a step that another has, of whose light it may be
 
 
 class ChunkFitter:
@@ -97,7 +92,7 @@ class ChunkFitter:
             steps, in_vain = large_steps(self.neighbours, self.mapper)
             self._tries_spheres = not in_vain
         rejected: list[Step] = []
-        for self.rounds in range(1, ROUNDS + 1):
+        for self.rounds in range(1, 10 + 1):  # each takes what was found so far off the contrast
             fresh = [
                 s
                 for s in self._search(maps, steps)
@@ -114,7 +109,7 @@ class ChunkFitter:
             relevant = self._relevant(steps, bound)
             new = relevant.intersection(range(known, len(steps)))
             chosen = new
-            for _ in range(_SWEEPS):
+            for _ in range(10):  # over what has neighbours that still move
                 improved = self._improve(steps, chosen, seen)
                 moved = {i for i in chosen if _has_moved(steps[i], improved[i])}
                 steps = improved
@@ -428,7 +423,7 @@ def _has_moved(old: Step, new: Step) -> bool:
 
 def _outshines(other: Step, step: Step) -> bool:
     """Whether a step may be what is left of another, much stronger one whose light rises slowly."""
-    return other.at.rise > 0 and other.start.mass_kda > _LEAST_MASS_RATIO * step.start.mass_kda
+    return other.at.rise > 0 and other.start.mass_kda > 5 * step.start.mass_kda
 
 
 def _places(steps: Sequence[Step]) -> tuple[FloatArray, FloatArray]:

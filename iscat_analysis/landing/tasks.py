@@ -31,8 +31,6 @@ FEWEST_FRAMES = 10
 TRACE_FRAMES = 400
 """Frames with a particle that tell how steady its light is, unless three windows are more."""
 
-_LEAST_MASS_RATIO = 3.0  # of a particle over a step that may be a change of its light
-
 
 @dataclass(frozen=True)
 class Task:
@@ -183,7 +181,7 @@ class TaskBuilder:
             id(s)
             for s in close
             if distance_px(s, step) * pixel < SAME_NM
-            and s.start.mass_kda * _LEAST_MASS_RATIO <= step.start.mass_kda
+            and 3 * s.start.mass_kda <= step.start.mass_kda
         }
         own = tuple(s for s in others if id(s) not in changes)
         without, there = windows.frames_before, windows.frames_after

@@ -70,8 +70,6 @@ CHANGES = 4.0
 """Spread of the mass between parts of an event's frames over that of its light, beyond which it is
 no constant particle: with 4 degrees of freedom or more by chance once in 10¹²."""
 
-_NEAR = 2.0  # λ/NA from a particle, within which a wrong model leaves most of it over
-
 
 @dataclass(frozen=True)
 class Background:
@@ -346,7 +344,8 @@ def _uneven_finding(
     rows, columns = windows.after_e.shape
     field, signal = Region((0, rows), (0, columns)), np.zeros(windows.after_e.shape)
     optics = context.config.optics
-    near_nm = _NEAR * optics.wavelength_nm / optics.na
+    # within which a wrong model leaves most of a particle over
+    near_nm = 2 * optics.wavelength_nm / optics.na
     y, x = (context.pixel_nm * index for index in np.indices(signal.shape))
     away = np.ones(signal.shape, dtype=np.bool_)
     for event in events:

@@ -70,8 +70,6 @@ from iscat_analysis.threads import threads
 if TYPE_CHECKING:
     from iscat_analysis.pipeline.stored import StoredResult
 
-_SAME_PX = 2.0
-
 
 @dataclass(frozen=True)
 class Injected:
@@ -215,7 +213,7 @@ def _recovery(
         if side * sign < 0:
             continue
         close = np.hypot(x - p.x_px, y - p.y_px)
-        near = (close < _SAME_PX) & (mass * side > 0)
+        near = (close < 2.0) & (mass * side > 0)
         # beside the stated interval of the frame
         near &= np.abs(frame - when) <= error + 4
         best = int(np.argmin(np.where(near, close, np.inf))) if near.any() else -1

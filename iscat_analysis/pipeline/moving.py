@@ -47,9 +47,6 @@ from iscat_analysis.tracking.stages import blurred_rows
 if TYPE_CHECKING:
     from iscat_analysis.pipeline.stored import StoredResult
 
-AROUND = 100
-"""Frames that make the background of one frame in which particles move."""
-
 
 def track_in_frames(
     ready: Prepared, run: Run, ground: Background, pool: ThreadPoolExecutor
@@ -91,7 +88,7 @@ class MovingSearch:
         self._config, check = config, checked(movie, camera)
         self.frames = first, last = fitted_frames(movie, config)
         self.longest = last - first
-        self.window = min(AROUND, self.longest)
+        self.window = min(100, self.longest)  # frames that make the background of one
         self._context = tracking_context(config, ready.shape, max(last - first, 1), ready.lines)
 
         @lru_cache(1)

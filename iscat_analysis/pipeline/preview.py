@@ -170,7 +170,6 @@ class Preview:
 
 _SAMPLED = 5  # frames from which limits of the contrast are taken, at most
 _READ_BYTES = 2**29  # of frames that are looked at before a movie is shown, for either purpose
-_INSIDE = (0.001, 0.999)  # quantiles of the pixels that such limits leave inside
 
 
 def film_limits(
@@ -180,7 +179,7 @@ def film_limits(
     looked = np.unique(np.linspace(frames[0], frames[1] - 1, most).astype(int))
     seen = np.concatenate([np.ravel(image(int(t))) for t in looked]).astype(np.float64)
     seen = seen[np.isfinite(seen)]
-    low, high = np.quantile(seen, _INSIDE) if seen.size else (0.0, 1.0)
+    low, high = np.quantile(seen, (0.001, 0.999)) if seen.size else (0.0, 1.0)
     return float(low), float(high if high > low else low + 1.0)
 
 
