@@ -13,6 +13,7 @@ import traceback
 import warnings
 from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -49,6 +50,7 @@ class _Console(Console):
         return super().render_str(in_terminal(text), **options)
 
 
+@dataclass
 class Messages:
     """Progress, notes and errors of one command, on stderr.
 
@@ -56,21 +58,14 @@ class Messages:
     tracebacks, and `json` prints results as one JSON object.  `command` is the whole command line.
     """
 
-    def __init__(
-        self,
-        name: str,
-        *,
-        quiet: bool = False,
-        debug: bool = False,
-        json: bool = False,
-        command: str = "",
-    ) -> None:
-        self.name = name
-        self.quiet = quiet
-        self.debug = debug
-        self.json = json
-        self.command = command
-        self.writing = False
+    name: str
+    quiet: bool = False
+    debug: bool = False
+    json: bool = False
+    command: str = ""
+    writing: bool = False
+
+    def __post_init__(self) -> None:
         self._terminal = _Console(stderr=True)
 
     def error(self, text: str) -> None:

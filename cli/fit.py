@@ -147,23 +147,29 @@ def fit(
         how: Any = {"command": messages.command, "inject": inject or 0, "executor": executor}
         how["overwrite"] = output.overwrite
         analysis = fit_stack(stack, resolved, out=folder, **how, **told)
+    rows = _show(messages, analysis, folder)
+    if strict is not None and (
+        any(map(_is_flagged, rows))
+        or analysis.summary.get("repeats", {}).get("understated", False)
+        or codes & {finding.code for finding in analysis.findings}
+    ):
+        raise typer.Exit(3)  # something is flagged
+
+
+def _show(messages: Messages, analysis: Analysis, folder: Path) -> list[dict[str, Any]]:
+    """Print what was found, and give its rows, events and tracks."""
     rows: list[dict[str, Any]] = analysis.table.to_dict("records")
     found: dict[str, Any] = {**analysis.summary, "events": rows, "out": str(folder)}
     if analysis.tracks is None:
         messages.show("fit", found, _event_lines(analysis, folder))
         messages.note(*_advice(rows))
-    else:
-        from iscat_analysis.report.answer import advice
+        return rows
+    from iscat_analysis.report.answer import advice
 
-        found["tracks"] = analysis.tracks.to_dict("records")
-        messages.show("fit", found, _track_lines(analysis, folder))
-        messages.note(*_advice(rows), *advice(analysis.tracks))
-    if strict is not None and (
-        any(map(_is_flagged, (*rows, *found.get("tracks", ()))))
-        or analysis.summary.get("repeats", {}).get("understated", False)
-        or codes & {finding.code for finding in analysis.findings}
-    ):
-        raise typer.Exit(3)  # something is flagged
+    found["tracks"] = analysis.tracks.to_dict("records")
+    messages.show("fit", found, _track_lines(analysis, folder))
+    messages.note(*_advice(rows), *advice(analysis.tracks))
+    return [*rows, *found["tracks"]]
 
 
 def _codes(strict: str | None) -> frozenset[str]:

@@ -228,7 +228,9 @@ def command(work: Callable[..., None]) -> Command:
     arguments = iter([name for name in helps if not name.startswith("--")])
     declared = inspect.signature(work, eval_str=True).parameters
     groups: dict[str, Any] = {
-        name: each.annotation for name, each in declared.items() if is_dataclass(each.annotation)
+        name: each.annotation
+        for name, each in declared.items()
+        if is_dataclass(each.annotation) and name != "messages"
     }
     for group in (*groups.values(), _Always):
         for part in group.__mro__:
@@ -246,8 +248,7 @@ def command(work: Callable[..., None]) -> Command:
 
     @wraps(work)
     def run(context: typer.Context, *, quiet: bool, debug: bool, **given: Any) -> None:
-        json, words = given.get("json", False), context.obj
-        told = Messages(context.command_path, quiet=quiet, debug=debug, command=words, json=json)
+        told = Messages(context.command_path, quiet, debug, given.get("json", False), context.obj)
         if len(configs := given.get("config") or ()) > 1:
             first, *later = map(str, configs)
             from iscat_analysis.findings.setup import CONFIGURATION_MERGED

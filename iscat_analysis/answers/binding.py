@@ -162,20 +162,40 @@ def fit_kd(
     >>> found.fit.kd_low < 10 < found.fit.kd_high
     True
     """
-    check_reaction(model, options["masses_kda"])
-    power = options["landing_power"]
-    if power is not None and not -1 <= number_in("`landing_power`", power) <= 1:
-        raise ConfigError(f"`landing_power` = {power:g}: must lie between -1 and 1, as in -0.167")
-    truth_in("`inactive`", options["inactive"])
+    _check(model, options)
     folder = folder_for(out, "kd.csv", "kd.json", "figures", overwrite=overwrite)
     name = "samples" if isinstance(samples, pd.DataFrame) else str(samples)
     rows, totals, found, findings = _series(samples, name, model, tables, options)
     masses, about = _masses(found, model, options["masses_kda"])
     events = [_to_fit(table) for table in found]
-    inactive = options["inactive"]
-    fit = fit_equilibrium(
-        events, totals, model=model, masses_kda=masses, power=power, inactive=inactive
-    )
+    how: Any = {"power": options["landing_power"], "inactive": options["inactive"]}
+    fit = fit_equilibrium(events, totals, model=model, masses_kda=masses, **how)
+    _refuse_undetected(name, fit)
+    notes = [
+        *(finding.text for finding in existing([*findings, about])),
+        *sentences(finding for table in found for finding in table.findings),
+        *(finding.text for finding in _doubts(found, fit, masses, inactive=options["inactive"])),
+    ]
+    curve = _curve(totals, fit, model)
+    result = Binding(model, fit, _laid_out(rows, found, fit), curve, tuple(notes))
+    tell(notes, notify)
+    contents = {"source": name, **result.to_dict()}
+    files = {"kd.csv": in_table(result.samples), "kd.json": ("kd", contents)}
+    folder.write(files, lambda: binding_figure(jsonable(contents)))
+    return result
+
+
+def _check(model: Model, options: BindingOptions) -> None:
+    """Refuse impossible options."""
+    check_reaction(model, options["masses_kda"])
+    power = options["landing_power"]
+    if power is not None and not -1 <= number_in("`landing_power`", power) <= 1:
+        raise ConfigError(f"`landing_power` = {power:g}: must lie between -1 and 1, as in -0.167")
+    truth_in("`inactive`", options["inactive"])
+
+
+def _refuse_undetected(name: str, fit: EquilibriumFit) -> None:
+    """Refuse a series of which hardly any of the lightest species is detected."""
     lightest = int(np.argmin(fit.masses_kda))
     if fit.detected[lightest] < LEAST_EFFICIENCY:
         raise DataError(
@@ -184,18 +204,6 @@ def fit_kd(
             "kDa), so that K_D is not determined; a lower threshold of detection would tell, or "
             "`limit_kda` if it is known"
         )
-    notes = [
-        *(finding.text for finding in existing([*findings, about])),
-        *sentences(finding for table in found for finding in table.findings),
-        *(finding.text for finding in _doubts(found, fit, masses, inactive=inactive)),
-    ]
-    samples_table = _laid_out(rows, found, fit)
-    result = Binding(model, fit, samples_table, _curve(totals, fit, model), tuple(notes))
-    tell(notes, notify)
-    contents = {"source": name, **result.to_dict()}
-    files = {"kd.csv": in_table(result.samples), "kd.json": ("kd", contents)}
-    folder.write(files, lambda: binding_figure(jsonable(contents)))
-    return result
 
 
 def _series(

@@ -24,6 +24,7 @@ Rates of landing and leaving from a table of events that has frames.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -315,34 +316,43 @@ def fit_kinetics(
         raise ConfigError("`frame_rate_hz`: rates need the frames per second; give it")
     number_in("`frame_rate_hz`", frame_rate_hz, above=0.0)
     number_in("`radius_px`", radius_px, above=0.0)
-    frame = table.frame
-    if not np.isfinite(frame).all():
+    if not np.isfinite(table.frame).all():
         raise DataError(f"{table.name}: has events without a frame, so that there is no rate")
-    if frames is None:
-        start, stop = int(frame.min()), int(frame.max()) + 1
-    else:
-        start, stop = _range_of(frames)
-    inside = (frame >= start) & (frame < stop)
+    start, stop = _range_of(frames, table.frame)
+    inside = (table.frame >= start) & (table.frame < stop)
     if not inside.any():
         raise DataError(f"{table.name}: no event lies in the frames {start}:{stop}")
-    lands = inside & (table.mass_kda > 0)
-    landing = landing_rate(
-        (frame[lands] - start + 0.5) / frame_rate_hz, (stop - start) / frame_rate_hz
-    )
-    findings = []
-    searched = table.efficiency.searched if table.efficiency else 1.0
-    if searched < 1:
-        kept = ("per_second", "per_second_low", "per_second_high")
-        landing = replace(landing, **{name: getattr(landing, name) / searched for name in kept})
-    if searched < _SEARCHED:
-        findings.append(PARTLY_SEARCHED({"share": searched}))
+    landing = _landing(table, inside, (start, stop), frame_rate_hz)
     unbinding = _unbinding(table, inside, stop, frame_rate_hz, radius_px)
+    findings = tuple(_doubts(table, landing, unbinding))
+    return Kinetics(landing, unbinding, frame_rate_hz, (start, stop), findings)
+
+
+def _searched(table: EventTable) -> float:
+    return table.efficiency.searched if table.efficiency else 1.0
+
+
+def _landing(
+    table: EventTable, inside: BoolArray, frames: tuple[int, int], rate_hz: float
+) -> LandingRate:
+    """Fit the rate of landing, of all of field and time."""
+    start, stop = frames
+    times = (table.frame[inside & (table.mass_kda > 0)] - start + 0.5) / rate_hz
+    seen = landing_rate(times, (stop - start) / rate_hz)
+    rates = ("per_second", "per_second_low", "per_second_high")
+    return replace(seen, **{name: getattr(seen, name) / _searched(table) for name in rates})
+
+
+def _doubts(
+    table: EventTable, landing: LandingRate, unbinding: UnbindingRate | None
+) -> Iterator[Finding]:
+    """Doubt the rates."""
+    if (searched := _searched(table)) < _SEARCHED:
+        yield PARTLY_SEARCHED({"share": searched})
     if landing.p_value < _WRONG:
-        findings.append(NO_DEPLETION_LAW({"p_value": landing.p_value}))
+        yield NO_DEPLETION_LAW({"p_value": landing.p_value})
     if unbinding is not None and unbinding.chance_pairs > _CHANCE * max(unbinding.pairs, 1):
-        values = {"chance": unbinding.chance_pairs, "pairs": unbinding.pairs}
-        findings.append(CHANCE_PAIRS(values))
-    return Kinetics(landing, unbinding, frame_rate_hz, (start, stop), tuple(findings))
+        yield CHANCE_PAIRS({"chance": unbinding.chance_pairs, "pairs": unbinding.pairs})
 
 
 def configured_frame_rate(path: Path) -> float | None:
@@ -357,8 +367,10 @@ def configured_frame_rate(path: Path) -> float | None:
         return None
 
 
-def _range_of(frames: tuple[int, int]) -> tuple[int, int]:
-    """Check a range of frames."""
+def _range_of(frames: tuple[int, int] | None, of_events: FloatArray) -> tuple[int, int]:
+    """Check a range of frames, by default from the first to the last event."""
+    if frames is None:
+        return int(of_events.min()), int(of_events.max()) + 1
     if not isinstance(frames, (tuple, list)) or len(frames) != 2:
         raise ConfigError(f"`frames` = {shown(frames)}: give the first and the one after the last")
     start, stop = (int(number_in("`frames`", frame, least=0, whole=True)) for frame in frames)

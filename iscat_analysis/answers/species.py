@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 import pandas as pd
 
 from iscat_analysis.answers.kinetics import Kinetics
-from iscat_analysis.answers.output import Notify, folder_for, tell
+from iscat_analysis.answers.output import AnswerFolder, Notify, folder_for, tell
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import choice_in, number_in, shown, truth_in
 from iscat_analysis.options import EventOptions, SpeciesOptions, only, takes
@@ -83,44 +83,42 @@ def find_species(
     >>> round(found.ladder.monomer_kda), found.ladder.steps
     (66, (1, 2))
     """
-    choice = choice_of(options)
+    choice, branch = choice_of(options), options["branch"]
     draws = int(number_in("`draws`", draws, least=0, most=_MOST_DRAWS, whole=True))
     seed = int(number_in("`seed`", seed, least=0, whole=True))
     if kinetics is not None and not isinstance(kinetics, Kinetics):
         raise ConfigError(f"`kinetics` = {shown(kinetics)}: give what `fit_kinetics` returns")
-    branch = options["branch"]
-    choice_in("`branch`", branch, ("magnitude", "landing", "leaving"))
-    folder = folder_for(out, "species.csv", "species.json", "figures", overwrite=overwrite)
+    names = ("species.csv", "species.json", "figures")
+    folder = folder_for(out, *names, overwrite=overwrite, notify=notify)
     table = event_table(events, **only(EventOptions, options))
     _refuse_impossible(table, choice)
-    found = describe(
-        table.mass_kda,
-        table.sigma_kda,
-        efficiency=table.efficiency,
-        seed=seed,
-        branch=branch,
-        draws=draws,
-        scale_error=table.scale_error,
-        window_frames=table.window_frames,
-        choice=choice,
-        limit_known=table.edge_kda is None,
-    )
+    of_table = ("efficiency", "scale_error", "window_frames")
+    known: Any = {name: getattr(table, name) for name in of_table}
+    known |= {"limit_known": table.edge_kda is None, "choice": choice, "branch": branch}
+    found = describe(table.mass_kda, table.sigma_kda, seed=seed, draws=draws, **known)
     if found.events < LEAST_EVENTS:
         kind = "event" if branch == "magnitude" else f"{branch} event"
         raise DataError(
             f"{table.name}: holds {count(found.events, kind)}, too few for species; "
             f"{LEAST_EVENTS} are needed"
         )
+    _write(folder, table, found, kinetics)
+    return found
+
+
+def _write(
+    folder: AnswerFolder, table: EventTable, found: Distribution, kinetics: Kinetics | None
+) -> None:
+    """Tell the notes, and write species and rates."""
     rates = () if kinetics is None else kinetics.notes
     notes = [*sentences(table.remarks), *found.notes, *rates]
-    tell(notes, notify)
+    tell(notes, folder.notify)
     contents = {"source": table.name, **found.to_dict(), "notes": notes}
     if kinetics is not None:
         contents["kinetics"] = kinetics.to_dict()
-    files = {"species.csv": found.species, "species.json": ("species", contents)}
     sketch = ("species", partial(species_figure, jsonable(contents)))
+    files = {"species.csv": found.species, "species.json": ("species", contents)}
     folder.write(files, lambda: drawn([sketch]))
-    return found
 
 
 def _refuse_impossible(table: EventTable, choice: choices.Choice) -> None:
@@ -159,6 +157,7 @@ def choice_of(options: SpeciesOptions) -> choices.Choice:
         truth_in(f"`{name}`", value)
     widths = options["widths"]
     choice_in("`widths`", widths, ("common", "free"))
+    choice_in("`branch`", options.get("branch", "magnitude"), ("magnitude", "landing", "leaving"))
     for name, several in (("masses_kda", masses_kda), ("start_kda", start_kda), ("steps", steps)):
         if several is not None and not isinstance(several, (list, tuple, np.ndarray)):
             raise ConfigError(f"`{name}` = {shown(several)}: give a list, as in [66, 132]")
