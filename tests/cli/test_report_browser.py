@@ -209,9 +209,15 @@ def show(browser: Any, page: Path, *, width: int = 1440, scheme: str = "light") 
     prefer(browser, scheme)
     metrics = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
-    browser.get_log("browser")
+    errors(browser)
     browser.get(page.as_uri())
     browser.execute_async_script(READY, page.as_uri())
+
+
+def texts(browser: Any, selector: str) -> list[str]:
+    """Texts of all that a selector finds."""
+    script = "return [...document.querySelectorAll(arguments[0])].map((n) => n.textContent)"
+    return list(browser.execute_script(script, selector))
 
 
 def errors(browser: Any) -> list[str]:
@@ -219,11 +225,7 @@ def errors(browser: Any) -> list[str]:
 
 
 def first_cells(browser: Any, column: int) -> list[str]:
-    script = (
-        "return [...document.querySelectorAll('#table tbody tr[id]:not([hidden])')]"
-        ".map((row) => row.cells[arguments[0]].textContent)"
-    )
-    return list(browser.execute_script(script, column))
+    return texts(browser, f"#table tbody tr[id]:not([hidden]) > :nth-child({column + 1})")
 
 
 def click(browser: Any, selector: str) -> None:
@@ -246,36 +248,27 @@ def shown_rows(browser: Any, least: int = 0) -> int:
     return int(browser.execute_async_script(script, least))
 
 
-REPORTS = ("mass", "joint", "localize", "track", "darkfield", "one", "landing")
-DOCUMENTS = (
-    "document", "calibration", "camera", "benchmark", "comparison", "batch_1", "batch_3", "batch_60"
-)  # fmt: skip
-NAMES = (*REPORTS, "none", *DOCUMENTS)
+REPORTS = ("mass", "joint", "localize", "track", "darkfield", "one", "none", "landing")
+WRITTEN = ("document", "calibration", "camera", "benchmark", "comparison")
+NAMES = (*REPORTS, *WRITTEN, "batch_1", "batch_3", "batch_60")
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("width", [390, 1440])
-def test_fits_the_screen_without_errors(
-    browser: Any, pages: dict[str, Path], name: str, width: int
+def test_fits_the_screen_without_errors_and_can_be_read(
+    browser: Any, pages: dict[str, Path], name: str
 ) -> None:
-    show(browser, pages[name], width=width)
-    browser.execute_script(
-        "for (const row of document.querySelectorAll('#row-0, #row-1')) {"
-        "  row.querySelector('.toggle').click(); }"
-    )
-    widths = browser.execute_script(
-        "return [document.documentElement.scrollWidth, document.documentElement.clientWidth]"
-    )
-    assert widths[0] <= widths[1] == width
-    assert browser.execute_script(OVERLAPS) == []
-    assert errors(browser) == []
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_every_text_has_enough_contrast(browser: Any, pages: dict[str, Path], name: str) -> None:
-    show(browser, pages[name])
-    if name in REPORTS:
-        click(browser, "#row-0 .toggle")
+    for width in (390, 1440):
+        show(browser, pages[name], width=width)
+        browser.execute_script(
+            "for (const row of document.querySelectorAll('#row-0, #row-1')) {"
+            "  row.querySelector('.toggle').click(); }"
+        )
+        widths = browser.execute_script(
+            "return [document.documentElement.scrollWidth, document.documentElement.clientWidth]"
+        )
+        assert widths[0] <= widths[1] == width
+        assert browser.execute_script(OVERLAPS) == []
+        assert errors(browser) == []
     for scheme in ("light", "dark"):
         prefer(browser, scheme)
         seen, poor = browser.execute_script(POOR_CONTRAST, AA_NORMAL, AA_LARGE)
@@ -295,31 +288,28 @@ def test_the_toggle_overrides_the_system(browser: Any, pages: dict[str, Path]) -
 
 
 def column(browser: Any, heading: str) -> int:
-    heads = browser.execute_script(
-        "return [...document.querySelectorAll('#table th')].map((h) => h.textContent)"
-    )
-    return int(heads.index(heading))
+    return texts(browser, "#table th").index(heading)
 
 
 def value(text: str) -> float:
     return float(text.replace("−", "-"))
 
 
-@pytest.mark.parametrize("heading", ["SNR", "mass [kDa]"])
-def test_columns_sort_both_ways(browser: Any, pages: dict[str, Path], heading: str) -> None:
+def test_columns_sort_both_ways(browser: Any, pages: dict[str, Path]) -> None:
     show(browser, pages["mass"])
-    at = column(browser, heading)
-    head = f"#table th:nth-child({at + 1})"
-    seen = []
-    for order in ("ascending", "descending"):
-        click(browser, f"{head} button")
-        sort = "return document.querySelector(arguments[0]).getAttribute('aria-sort')"
-        assert browser.execute_script(sort, head) == order
-        seen.append([value(text) for text in first_cells(browser, at)])
-    rising, falling = seen
-    assert rising == sorted(rising)
-    assert falling == sorted(falling, reverse=True)
-    assert falling[0] > rising[0]
+    for heading in ("SNR", "mass [kDa]"):
+        at = column(browser, heading)
+        head = f"#table th:nth-child({at + 1})"
+        seen = []
+        for order in ("ascending", "descending"):
+            click(browser, f"{head} button")
+            sort = "return document.querySelector(arguments[0]).getAttribute('aria-sort')"
+            assert browser.execute_script(sort, head) == order
+            seen.append([value(text) for text in first_cells(browser, at)])
+        rising, falling = seen
+        assert rising == sorted(rising)
+        assert falling == sorted(falling, reverse=True)
+        assert falling[0] > rising[0]
 
 
 def test_the_keyboard_sorts_filters_and_opens(browser: Any, pages: dict[str, Path]) -> None:
@@ -339,10 +329,7 @@ def test_the_keyboard_sorts_filters_and_opens(browser: Any, pages: dict[str, Pat
 @pytest.mark.parametrize("name", ["mass", "joint", "landing"])
 def test_the_numbers_of_a_column_line_up(browser: Any, pages: dict[str, Path], name: str) -> None:
     show(browser, pages[name])
-    heads = browser.execute_script(
-        "return [...document.querySelectorAll('#table th')].map((h) => h.textContent)"
-    )
-    for place, head in list(enumerate(heads))[2:-1]:
+    for place, head in list(enumerate(texts(browser, "#table th")))[2:-1]:
         cells = first_cells(browser, place)
         decimals = {
             len(text.partition(".")[2]) for text in cells if text != "—" and "×" not in text
@@ -352,9 +339,8 @@ def test_the_numbers_of_a_column_line_up(browser: Any, pages: dict[str, Path], n
 
 def test_a_landing_movie_shows_its_noise_curve(browser: Any, pages: dict[str, Path]) -> None:
     show(browser, pages["landing"])
-    script = "return document.getElementById('diagnostics-figure').textContent"
-    assert "variance over shot noise" in browser.execute_script(script)
-    text = browser.execute_script("return document.getElementById('diagnostics').textContent")
+    (figure,), (text,) = (texts(browser, f"#diagnostics{end}") for end in ("-figure", ""))
+    assert "variance over shot noise" in figure
     for said in ("Windows of", "Drift of the fixed pattern", "added to the movie"):
         assert said in text
 
@@ -443,8 +429,7 @@ def test_posteriors_are_drawn_and_refused_ones_say_why(
     browser: Any, pages: dict[str, Path]
 ) -> None:
     show(browser, pages["mass"])
-    text = browser.execute_script("return document.getElementById('posterior').textContent")
-    assert "split R-hat of z_nm is 1.31" in text
+    assert "split R-hat of z_nm is 1.31" in texts(browser, "#posterior")[0]
     drawn = "return [...document.querySelectorAll('#posterior figure')].map((f) => f.id)"
     assert browser.execute_script(drawn) == ["corner_0001", "corner_0002"]
 
@@ -501,8 +486,8 @@ def test_figures_follow_the_theme(browser: Any, pages: dict[str, Path]) -> None:
 def test_tables_of_documents_sort(browser: Any, pages: dict[str, Path]) -> None:
     show(browser, pages["document"])
     click(browser, "table.sortable th:nth-child(2) button")
-    script = "return [...document.querySelectorAll('tbody tr')].map((r) => r.cells[0].textContent)"
-    assert browser.execute_script(script) == ["mass", "x", "y", "z"]  # the missing one last
+    names = texts(browser, "tbody tr > :first-child")
+    assert names == ["mass", "x", "y", "z"]  # the missing one last
 
 
 @pytest.mark.parametrize("name", ["calibration", "benchmark", "comparison"])
@@ -525,40 +510,27 @@ def test_written_tables_sort(browser: Any, pages: dict[str, Path], name: str) ->
             assert rising != falling
 
 
-QUALITY = "#quality table"
-
-
-def quality_cells(browser: Any, column: int) -> list[str]:
-    script = (
-        "return [...document.querySelectorAll('#quality tbody tr:not([hidden])')]"
-        ".map((row) => row.cells[arguments[0]].textContent)"
-    )
-    return list(browser.execute_script(script, column))
-
-
 def test_a_batch_sorts_narrows_and_links(browser: Any, pages: dict[str, Path]) -> None:
+    def cells(column: int) -> list[str]:
+        return texts(browser, f"#quality tbody tr:not([hidden]) > :nth-child({column + 1})")
+
     show(browser, pages["batch_60"])
-    heads = browser.execute_script(
-        "return [...document.querySelectorAll('#quality th')].map((h) => h.textContent)"
-    )
-    at = heads.index("events")
-    click(browser, f"{QUALITY} th:nth-child({at + 1}) button")
-    counts = [value(text) for text in quality_cells(browser, at)]
+    at = texts(browser, "#quality th").index("events")
+    click(browser, f"#quality table th:nth-child({at + 1}) button")
+    counts = [value(text) for text in cells(at)]
     assert counts == sorted(counts)
     assert len(counts) == 60
     browser.execute_script(
         "const input = document.querySelector('#quality .narrow input');"
         "input.value = 'cut short'; input.dispatchEvent(new Event('input'));"
     )
-    assert quality_cells(browser, 0) == ["day/pH 9/movie_59"]
-    links = browser.execute_script(
-        "return [...document.querySelectorAll('#quality a')].map((a) => a.getAttribute('href'))"
+    assert cells(0) == ["day/pH 9/movie_59"]
+    links, addresses = browser.execute_script(
+        "return [[...document.querySelectorAll('#quality a')].map((a) => a.getAttribute('href')),"
+        "[...document.querySelectorAll('[src], link')].map((e) => e.src || e.href)]"
     )
     assert len(links) == 59
     assert "movies/day/pH%206/movie_0.iscat/report.html" in links
-    addresses = browser.execute_script(
-        "return [...document.querySelectorAll('[src], link')].map((e) => e.src || e.href)"
-    )
     assert all(address.startswith("data:") for address in addresses)
 
 

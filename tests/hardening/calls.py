@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ def _spoilt(value: Any, rng: Generator) -> Any:
         changed[at] = _spoilt(changed[at], rng)
         return changed
     if isinstance(value, dict):
-        section, key = str(rng.choice(_SECTIONS)), ""
+        section = str(rng.choice(_SECTIONS))
         key = str(rng.choice(sorted(known_keys([section]))))
         return value | {f"{section}.{key}": _any(rng)}
     return _any(rng)
@@ -129,16 +130,10 @@ def _as_float(value: Any) -> float:
 
 
 _SECTIONS = ("optics", "camera", "particle", "fit", "simulation", "bounds", "background", "track")
-_KEPT: dict[str, Call] = {}
 
 
+@cache
 def _seeds() -> dict[str, Call]:
-    if not _KEPT:
-        _KEPT.update(_made())
-    return _KEPT
-
-
-def _made() -> dict[str, Call]:
     rng = np.random.default_rng(47)
     optics, camera = ia.Optics(na=1.42, focus_nm=-300), ia.Camera(pixel_size_nm=84.4)
     protein = ia.Particle(mass_kda=480)

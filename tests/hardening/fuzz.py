@@ -56,20 +56,7 @@ Generator = np.random.Generator
 
 
 def mutated(original: bytes, other: bytes, rng: Generator) -> bytes:
-    """Damage a file.
-
-    Parameters
-    ----------
-    original, other : bytes
-        The file, and one to take pieces from.
-    rng : Generator
-        Decides everything.
-
-    Returns
-    -------
-    bytes
-        Never empty.
-    """
+    """Damage a file, with pieces of another; never to nothing."""
     data = bytearray(original)
     for _ in range(int(rng.integers(1, 7))):
         _MUTATIONS[int(rng.integers(len(_MUTATIONS)))](data, other, rng)
@@ -84,13 +71,11 @@ def _place(data: bytearray, rng: Generator) -> int:
     return int(rng.integers(end))
 
 
-def _flip(data: bytearray, other: bytes, rng: Generator) -> None:
-    del other
+def _flip(data: bytearray, _: bytes, rng: Generator) -> None:
     data[_place(data, rng)] ^= 1 << int(rng.integers(8))
 
 
-def _overwrite(data: bytearray, other: bytes, rng: Generator) -> None:
-    del other
+def _overwrite(data: bytearray, _: bytes, rng: Generator) -> None:
     width = int(rng.choice([1, 2, 4, 8]))
     value = _INTERESTING[int(rng.integers(len(_INTERESTING)))] % (1 << 8 * width)
     at = _place(data, rng)
@@ -98,25 +83,21 @@ def _overwrite(data: bytearray, other: bytes, rng: Generator) -> None:
     data[at : at + width] = value.to_bytes(width, order)  # type: ignore[arg-type]
 
 
-def _cut(data: bytearray, other: bytes, rng: Generator) -> None:
-    del other
+def _cut(data: bytearray, _: bytes, rng: Generator) -> None:
     del data[_place(data, rng) :]
 
 
-def _delete(data: bytearray, other: bytes, rng: Generator) -> None:
-    del other
+def _delete(data: bytearray, _: bytes, rng: Generator) -> None:
     at = _place(data, rng)
     del data[at : at + int(rng.integers(1, 64))]
 
 
-def _insert(data: bytearray, other: bytes, rng: Generator) -> None:
-    del other
+def _insert(data: bytearray, _: bytes, rng: Generator) -> None:
     at = _place(data, rng)
     data[at:at] = _WORDS[int(rng.integers(len(_WORDS)))]
 
 
-def _replace(data: bytearray, other: bytes, rng: Generator) -> None:
-    del other
+def _replace(data: bytearray, _: bytes, rng: Generator) -> None:
     at, word = _place(data, rng), _WORDS[int(rng.integers(len(_WORDS)))]
     data[at : at + len(word)] = word
 
@@ -128,20 +109,17 @@ def _copy(data: bytearray, other: bytes, rng: Generator) -> None:
     data[at : at + size] = source[start : start + size]
 
 
-def _erase(data: bytearray, other: bytes, rng: Generator) -> None:
-    del other
+def _erase(data: bytearray, _: bytes, rng: Generator) -> None:
     at, size = _place(data, rng), int(rng.integers(1, 256))
     data[at : at + size] = bytes(min(size, len(data) - at))
 
 
-def _noise(data: bytearray, other: bytes, rng: Generator) -> None:
-    del other
+def _noise(data: bytearray, _: bytes, rng: Generator) -> None:
     at, size = _place(data, rng), int(rng.integers(1, 64))
     data[at : at + size] = rng.bytes(size)
 
 
-def _append(data: bytearray, other: bytes, rng: Generator) -> None:
-    del other
+def _append(data: bytearray, _: bytes, rng: Generator) -> None:
     data += rng.bytes(int(rng.integers(1, 512)))
 
 
@@ -239,24 +217,7 @@ def _work(first: int, stop: int, seed: int, folder: Path) -> None:
 
 
 def run(inputs: int, seed: int, first: int = 0) -> tuple[Counter[tuple[str, str]], list[str]]:
-    """Try many inputs.
-
-    Parameters
-    ----------
-    inputs : int
-        How many.
-    seed : int
-        Of all mutations.
-    first : int
-        Number of the first.
-
-    Returns
-    -------
-    Counter
-        How often each kind was read, refused, or failed.
-    list of str
-        One text for each failure.
-    """
+    """Try inputs; give how often each kind was read, refused or failed, and a text per failure."""
     counts: Counter[tuple[str, str]] = Counter()
     failures: list[str] = []
     number, stop = first, first + inputs

@@ -142,18 +142,7 @@ def write_events(path: Path, dialect: str) -> Path:
 
 
 def samples(folder: Path) -> dict[str, list[bytes]]:
-    """Make the bytes of every kind of file: ``tiff``, ``map``, ``mp``, ``h5`` and ``csv``.
-
-    Parameters
-    ----------
-    folder : Path
-        For the files; may be removed afterwards.
-
-    Returns
-    -------
-    dict of str to list of bytes
-        At least one file each.
-    """
+    """Make the bytes of every kind of file: ``tiff``, ``map``, ``mp``, ``h5`` and ``csv``."""
     frames = movie(5, 12, 14)
     smooth = np.cumsum(np.ones_like(movie(9, 12, 14)), axis=0, dtype="u2") * 9000
     found: dict[str, list[bytes]] = {"tiff": [], "map": [], "mp": [], "h5": [], "csv": []}
@@ -185,13 +174,9 @@ def samples(folder: Path) -> dict[str, list[bytes]]:
     take("mp", write_one_mp(path, frames, chunks=(2, 5, 14), compression="gzip", shuffle=True))
     take("mp", write_one_mp(path, frames, chunks=(1, 12, 14), compression="lzf"))
     take("mp", write_two_mp(path, frames, instrument="Refeyn TwoMP"))
+    encoded = {"differences": True, "encoding": "TIME_DIFFERENCE"}
     for number in (ZSTANDARD, LZ4, BLOSC):
-        take(
-            "mp",
-            write_two_mp(
-                path, smooth, differences=True, encoding="TIME_DIFFERENCE", filter_number=number
-            ),
-        )
+        take("mp", write_two_mp(path, smooth, filter_number=number, **encoded))
     take("mp", write_two_mp(path, smooth, differences=True, keyframes=4, old_names=True))
     for dialect in ("2021", "2024", "mpr", "one movie"):
         take("h5", write_events(path, dialect))

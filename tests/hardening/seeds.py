@@ -73,23 +73,20 @@ def seeds(folder: Path) -> dict[str, list[Seed]]:
     return found
 
 
+def _saved(save: Callable[..., Any], *given: Any, **more: Any) -> bytes:
+    """Give what a function writes into a file."""
+    out = io.BytesIO()
+    save(out, *given, **more)
+    return out.getvalue()
+
+
 def _npy(array: np.ndarray[Any, Any]) -> bytes:
-    out = io.BytesIO()
-    np.save(out, array)
-    return out.getvalue()
-
-
-def _saved(save: Callable[..., None], **arrays: Any) -> bytes:
-    out = io.BytesIO()
-    save(out, **arrays)
-    return out.getvalue()
+    return _saved(np.save, array)
 
 
 def _mat(packed: bool) -> bytes:
-    out = io.BytesIO()
     held = {"movie": _FRAMES.transpose(1, 2, 0), "setup": {"a": 1}, "text": "of Monday"}
-    scipy.io.savemat(out, held, do_compression=packed)
-    return out.getvalue()
+    return _saved(scipy.io.savemat, held, do_compression=packed)
 
 
 def _mat_hdf5(path: Path, **options: Any) -> bytes:
@@ -101,9 +98,8 @@ def _mat_hdf5(path: Path, **options: Any) -> bytes:
 def _frame_files() -> Seed:
     files = {}
     for number, frame in enumerate(_FRAMES):
-        out = io.BytesIO()
-        tifffile.imwrite(out, frame, compression="zlib" if number % 2 else None)
-        files[f"{_FOLDER}/frame{number}.tif"] = out.getvalue()
+        content = _saved(tifffile.imwrite, frame, compression="zlib" if number % 2 else None)
+        files[f"{_FOLDER}/frame{number}.tif"] = content
     return files
 
 
@@ -144,13 +140,9 @@ def _ome_set() -> Seed:
         '<?xml version="1.0"?><OME><Image ID="Image:0"><Pixels DimensionOrder="XYZCT" SizeT="6" '
         f'SizeC="1" SizeZ="1" SizeX="14" SizeY="12" Type="uint16">{blocks}</Pixels></Image></OME>'
     )
-    files = {}
-    for number, name in enumerate(names):
-        out = io.BytesIO()
-        part = _FRAMES[3 * number : 3 * number + 3]
-        tifffile.imwrite(out, part, description=text, metadata=None, photometric="minisblack")
-        files[name] = out.getvalue()
-    return files
+    how = {"description": text, "metadata": None, "photometric": "minisblack"}
+    parts = zip(names, (_FRAMES[:3], _FRAMES[3:]), strict=True)
+    return {name: _saved(tifffile.imwrite, part, **how) for name, part in parts}
 
 
 def _configurations() -> list[str]:
@@ -179,9 +171,7 @@ def _fits() -> pd.DataFrame:
 
 
 def _parquet(table: pd.DataFrame) -> bytes:
-    out = io.BytesIO()
-    table.to_parquet(out, index=False)
-    return out.getvalue()
+    return bytes(table.to_parquet(index=False))
 
 
 def _tables() -> list[Seed]:
@@ -215,11 +205,9 @@ def _result() -> Seed:
 
 
 def _cache() -> Seed:
-    out = io.BytesIO()
     images = np.arange(36.0).reshape(3, 3, 4)
     view = EventView(3, 1, 2, *images, clip=Clip((5,), 4, images[:1]))
-    np.savez(out, **packed((view, _events())))
-    return {"part.npz": out.getvalue()}
+    return {"part.npz": _saved(np.savez, **packed((view, _events())))}
 
 
 # ---- readers -------------------------------------------------------------------------------------

@@ -37,23 +37,31 @@ pytestmark = [
 
 DEADLINE_S = 120.0
 
-FRAMES = 1300
+FRAMES = 720
 LANDING = {
     "camera.pixel_size_nm": 84.0,
     "camera.gain_e_per_adu": 4.0,
     "optics.calibrate": "never",
     "particle.mass_kda": 146.0,
     "calibration.gradient_per_kda": -3.1e-5,
-    "background.window_frames": 40,
+    "background.window_frames": 20,
     "compute.memory_limit_mb": 64,
-    "simulation.shape": [120, 120],
+    "simulation.shape": [88, 88],
     "simulation.frames": FRAMES,
-    "simulation.photons_per_pixel": 1e5,
+    "simulation.photons_per_pixel": 2e5,
     "simulation.count": 8,
     "simulation.leavings": 2,
     "simulation.species": [480.0],
 }
 NAMES = ("a", "b")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_chunks() -> Iterator[None]:
+    """Divide this small movie as one of ten times as many pixels."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(planning, "MEMORY_SHARE", 0.14)
+        yield
 
 
 class Workers:

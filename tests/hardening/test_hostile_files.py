@@ -57,6 +57,18 @@ OME = (
 )
 
 
+def tagged(folder: Path, tag: int, text: str) -> Path:
+    """Write a movie of two frames, the first of which has a text."""
+    tags = {0: {tag: (ASCII, text)}}
+    return write_tiff(folder / "m.tif", pages_of(movie(2)), (10, 14), page_tags=tags)
+
+
+def same(path: Path) -> None:
+    """Read such a movie, whose text does not matter."""
+    with open_stack(path) as stack:
+        np.testing.assert_array_equal(stack.read(0, 2), movie(2))
+
+
 @pytest.mark.parametrize(
     "document",
     [
@@ -67,42 +79,22 @@ OME = (
     ids=["billion laughs", "external entity", "external DTD"],
 )
 def test_document_types_are_refused(tmp_path: Path, document: str) -> None:
-    frames = movie(2)
-    path = write_tiff(
-        tmp_path / "m.tif", pages_of(frames), (10, 14), page_tags={0: {270: (ASCII, document)}}
-    )
-    refuse(path, "declares a document type")
+    refuse(tagged(tmp_path, 270, document), "declares a document type")
 
 
 def test_deep_xml_neither_overflows_nor_matters(tmp_path: Path) -> None:
     deep = "<a>" * 100_000 + "</a>" * 100_000
-    frames = movie(2)
-    path = write_tiff(
-        tmp_path / "m.tif",
-        pages_of(frames),
-        (10, 14),
-        page_tags={0: {270: (ASCII, OME.format("", deep))}},
-    )
-    with open_stack(path) as stack:
-        np.testing.assert_array_equal(stack.read(0, 2), frames)
+    same(tagged(tmp_path, 270, OME.format("", deep)))
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, '{"shape": ' + "[" * 100_000, '{"a":' * 50_000])
 @pytest.mark.parametrize("tag", [270, 51123])
 def test_deep_json_neither_overflows_nor_matters(tmp_path: Path, tag: int, text: str) -> None:
-    frames = movie(2)
-    path = write_tiff(
-        tmp_path / "m.tif", pages_of(frames), (10, 14), page_tags={0: {tag: (ASCII, text)}}
-    )
-    with open_stack(path) as stack:
-        np.testing.assert_array_equal(stack.read(0, 2), frames)
+    same(tagged(tmp_path, tag, text))
 
 
 def test_deep_summary_of_micro_manager(tmp_path: Path) -> None:
-    frames = movie(2)
-    path = write_tiff(
-        tmp_path / "m.tif", pages_of(frames), (10, 14), page_tags={0: {51123: (ASCII, "{}")}}
-    )
+    path = tagged(tmp_path, 51123, "{}")
     data = path.read_bytes()
     summary = b"[" * 100_000
     (first,) = struct.unpack_from("<I", data, 4)
@@ -113,8 +105,7 @@ def test_deep_summary_of_micro_manager(tmp_path: Path) -> None:
     path.write_bytes(_shifted(start, head + summary, data[8:], shift))
     with pytest.raises(RecursionError), path.open("rb") as file:
         tifffile.read_micromanager_metadata(file, {"Summary"})  # the trap is set
-    with open_stack(path) as stack:
-        np.testing.assert_array_equal(stack.read(0, 2), frames)
+    same(path)
 
 
 def _shifted(start: bytes, inserted: bytes, rest: bytes, shift: int) -> bytes:
@@ -137,10 +128,7 @@ def _shifted(start: bytes, inserted: bytes, rest: bytes, shift: int) -> bytes:
 
 @pytest.mark.parametrize("digits", [21, 5000])
 def test_numbers_without_end(tmp_path: Path, digits: int) -> None:
-    text = "ImageJ=1.53\nimages=" + "9" * digits + "\n"
-    path = write_tiff(
-        tmp_path / "m.tif", pages_of(movie(2)), (10, 14), page_tags={0: {270: (ASCII, text)}}
-    )
+    path = tagged(tmp_path, 270, "ImageJ=1.53\nimages=" + "9" * digits + "\n")
     refuse(path, "describes 9+ frames but holds 2")
 
 

@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -102,11 +101,7 @@ class Runner:
 
     def __init__(self, folder: Path) -> None:
         self.bench = folder
-
-    @cached_property
-    def duration(self) -> float:
-        """Seconds of an undisturbed run, once what it needs is compiled."""
-        return float(self.here({"run": FIT, "cwd": str(self.bench)})["seconds"])
+        self.seconds: list[float] = []  # of undisturbed runs; the first one compiles
 
     def here(self, order: dict[str, Any]) -> dict[str, Any]:
         """Do in this process what `runner.py` does, which spares the imports of another one."""
@@ -123,7 +118,10 @@ class Runner:
             if "memory_share" in order:
                 patch.setattr(chunks, "MEMORY_SHARE", order["memory_share"])
             status = main(order["run"])
-        return {"status": status, "err": said.getvalue(), "seconds": time.monotonic() - begin}
+        seconds = time.monotonic() - begin
+        if status == 0 and order == {"run": FIT, "cwd": order["cwd"]}:
+            self.seconds.append(seconds)
+        return {"status": status, "err": said.getvalue(), "seconds": seconds}
 
     def run(self, *orders: dict[str, Any]) -> list[dict[str, Any]]:
         with ThreadPoolExecutor(len(orders)) as pool:
@@ -146,7 +144,7 @@ class Runner:
             if "kill" in order:
                 number, share = order["kill"]
                 with suppress(subprocess.TimeoutExpired):
-                    process.wait(share * order.get("duration", self.duration))
+                    process.wait(share * order.get("duration", min(self.seconds)))
                 process.send_signal(number)
             status = process.wait()
             seconds = time.monotonic() - begin
@@ -263,11 +261,8 @@ def test_killed_at_random_moments(runner: Runner, place: Path, share: float) -> 
     for number in range(max(10, round(share * KILLS))):
         if rng.random() < 0.5:
             shutil.rmtree(result, ignore_errors=True)
-        order = {
-            "run": FIT,
-            "cwd": str(place),
-            "kill": [signal.SIGKILL, float(rng.uniform(0, 1.1))],
-        }
+        kill = [signal.SIGKILL, float(rng.uniform(0, 1.1))]
+        order = {"run": FIT, "cwd": str(place), "kill": kill}
         (answer,) = runner.run(order)
         assert answer["status"] in (0, -signal.SIGKILL)
         hidden = [name for name in names(place) if name.startswith(".iscat-")]
@@ -414,7 +409,6 @@ def test_a_run_that_is_under_way_is_respected(runner: Runner, place: Path) -> No
     expected = f"result: another run (process {holder.pid}) is about to write there"
     assert expected in one_line(answer)
     assert not (place / "result").exists()
-    assert runner.here({"run": FIT, "cwd": str(place)})["status"] == 0
 
 
 # ---- disks ---------------------------------------------------------------------------------------
@@ -462,7 +456,7 @@ def test_a_full_disk(mount: Path) -> None:
     with atomic_folder(earlier) as building:
         (building / "fits.csv").write_text("event\n")
     ballast = mount / "ballast"
-    for kilobytes in (390, 370, 350, 320, 290, 250, 200, 150):
+    for kilobytes in (390, 350, 290, 200):
         ballast.write_bytes(bytes(kilobytes * 1000))
         with pytest.raises(DataError, match=r"cannot be (written|made) \(.*\S"):
             write_report(analysis, earlier, overwrite=True)
@@ -527,13 +521,6 @@ def test_names(runner: Runner, tmp_path: Path, name: str) -> None:
     assert "holds an earlier result" in one_line(answer)
 
 
-def test_a_name_that_is_too_long_is_refused_early(runner: Runner, place: Path) -> None:
-    run = ["fit", "movie.tif", "--config", "setup.toml", "--out", "z" * 300]
-    answer = runner.here({"run": run, "cwd": str(place)})
-    assert answer["status"] == 1
-    assert "File name too long" in one_line(answer)
-
-
 @pytest.mark.parametrize("detour", ["new/..", "new/../../{}", "."])
 def test_a_detour_never_replaces_a_folder_of_other_things(tmp_path: Path, detour: str) -> None:
     """`new` does not exist, so that only the resolved path says which folder is meant."""
@@ -549,16 +536,6 @@ def test_a_detour_never_replaces_a_folder_of_other_things(tmp_path: Path, detour
         (building / "fits.csv").write_text("")
     assert names(tmp_path) == ["home"]
     assert names(home) == ["thesis.tex"]
-
-
-def test_links_in_a_circle_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "a").symlink_to(tmp_path / "b")
-    (tmp_path / "b").symlink_to(tmp_path / "a")
-    with (
-        pytest.raises(DataError, match="out: cannot be found"),
-        atomic_folder(tmp_path / "a" / "out"),
-    ):
-        pass
 
 
 def test_neighbours_with_similar_names_are_left_alone(tmp_path: Path) -> None:
@@ -581,7 +558,7 @@ def test_neighbours_with_similar_names_are_left_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("sketched")
-@pytest.mark.parametrize("mode", ["mass", "localize", "joint", "track"])
+@pytest.mark.parametrize("mode", ["localize", "track"])
 def test_tables_read_back_by_their_own_libraries(tmp_path: Path, mode: str) -> None:
     out = write_report(make_analysis(7, mode), tmp_path / "out")
     text = pd.read_csv(out / "fits.csv", keep_default_na=True)
