@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
 Mapper = Callable[..., Iterable[Any]]
 """`map`, or the one of a pool."""
 

@@ -21,14 +21,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erfc, logsumexp
 
 from iscat_analysis._kernels.sliding import best_line, frame_scores, one_change, projector
-from iscat_analysis.records import FloatArray
+from iscat_analysis.records import FloatArray, IntArray
 from iscat_analysis.search.frames import Patch
-
-IntArray = NDArray[np.int64]
 
 _LEAST_GAIN = 6.0  # log-likelihood by which another course is better than the expected one
 _ALONE = 0.1  # probability that a step has a course of its own
@@ -204,7 +201,7 @@ class StepFrame:
         return self.frame + self.rise // 2
 
     @property
-    def turns(self) -> NDArray[np.int64]:
+    def turns(self) -> IntArray:
         """Frames at which equal parts of the new light appear."""
         return np.arange(self.first_turn, self.last_turn + 1)
 

@@ -28,7 +28,6 @@ from itertools import pairwise
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from iscat_analysis._kernels.canvas import box_of
 from iscat_analysis.camera import Camera
@@ -44,7 +43,7 @@ from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.optics.model import blurred
 from iscat_analysis.optics.parameters import FAINTEST
-from iscat_analysis.records import BoolArray, EventView, FloatArray, Windows
+from iscat_analysis.records import BoolArray, EventView, FloatArray, IntArray, Windows
 from iscat_analysis.threads import start_in_thread
 from iscat_analysis.tracking.field import MovingField
 from iscat_analysis.tracking.frames import Recording
@@ -61,8 +60,6 @@ from iscat_analysis.tracking.linking import (
 from iscat_analysis.tracking.rows import BackgroundEstimate, Localizations
 from iscat_analysis.tracking.stages import TrackedRows, find_rows_and_background
 from iscat_analysis.tracking.table import common_masses, moving_table, table_of_tracks
-
-IntArray = NDArray[np.int64]
 
 PHASES = 3
 """Parts of a pixel along each axis."""

@@ -51,10 +51,8 @@ from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.optics.model import blurred, spreads
 from iscat_analysis.optics.stamp import BAND, RINGS, sample_picture, weights_between
 from iscat_analysis.optics.waves import axial_table
-from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.records import BoolArray, FloatArray, IntArray
 from iscat_analysis.tracking.rows import BackgroundEstimate, Judged, Localizations, Response
-
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -402,8 +400,10 @@ class MovingField:
             return sums
 
         sums = self.sum_of(some, frames, at_once)
-        fitted = rows.fitted(particles.theta, fits.information, fits.gain) if sweeps else rows
-        return fitted, fits.outcome == CONVERGED, expected, sums
+        if sweeps:
+            snr = np.sqrt(2 * np.maximum(fits.gain, 0.0))
+            rows = replace(rows, theta=particles.theta, fisher=fits.information, snr=snr)
+        return rows, fits.outcome == CONVERGED, expected, sums
 
     def draw_anew(self) -> None:
         """Mark all pictures to be drawn again in the next pass."""
@@ -483,7 +483,15 @@ class MovingField:
             judge_frames(*given, fisher, turned, ways, bias, numbers, room)
 
         self.share(some, math.ceil(self.frames / BLOCK))
-        return Judged.of(fisher, turned, ways, bias, numbers, slopes, free=self.free[:4])
+        index = np.flatnonzero(self.free[:4])
+        part = np.ix_(np.arange(n), index, np.arange(index.size))
+        good = np.isfinite(turned[part]).all(axis=(1, 2))
+        v, ov = ways[part][good], turned[part][good]
+        o = ov @ np.linalg.inv(v)
+        observed, shift = np.full(fisher.shape, np.nan), np.zeros(bias.shape)
+        observed[np.ix_(good, index, index)] = (o + np.swapaxes(o, 1, 2)) / 2
+        shift[np.ix_(good, index)] = np.einsum("nik,njk,nj->ni", v, v, bias[good][:, index])
+        return Judged(fisher, observed, shift, slopes, *numbers.T)
 
     def sum_of(
         self,

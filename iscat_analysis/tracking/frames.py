@@ -54,6 +54,7 @@ from iscat_analysis.records import (
     CountSource,
     FloatArray,
     FrameSource,
+    IntArray,
     Mapper,
     Progress,
     Windows,
@@ -63,8 +64,6 @@ from iscat_analysis.tracking.field import Exposures, MovingField
 from iscat_analysis.tracking.joint import first_background
 from iscat_analysis.tracking.rows import BackgroundEstimate, Localizations
 from iscat_analysis.units import count, listed
-
-IntArray = NDArray[np.int64]
 
 BYTES = 16
 """Of memory for each pixel and frame of a block: counts, picture, slopes of the particles."""
@@ -224,7 +223,7 @@ def follow_light(
 
 
 def _stiffness(
-    means_e: FloatArray, read_e2: FloatArray, used: NDArray[np.bool_], frames: NDArray[np.int64]
+    means_e: FloatArray, read_e2: FloatArray, used: NDArray[np.bool_], frames: IntArray
 ) -> FloatArray:
     """Mean of ∂_i B ∂_j B/(B + read noise) over pixels and averages, without that of noise."""
     total = np.zeros((2, 2))

@@ -36,15 +36,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from iscat_analysis._kernels.background_response import Slopes, follow, own_shares, send
 from iscat_analysis.medians import middle
-from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.records import BoolArray, FloatArray, IntArray
 from iscat_analysis.tracking.field import BLOCK, MovingField
 from iscat_analysis.tracking.rows import BackgroundEstimate, Judged, Localizations
-
-IntArray = NDArray[np.int64]
 
 MOST_TURNS = 12
 """Steps at most."""
@@ -184,11 +181,7 @@ class Coupling:
     """Some rows and the pixels of their squares."""
 
     def __init__(
-        self,
-        field: MovingField,
-        ground: BackgroundEstimate,
-        slopes: Slopes,
-        rows: NDArray[np.int64],
+        self, field: MovingField, ground: BackgroundEstimate, slopes: Slopes, rows: IntArray
     ) -> None:
         self._slopes, self._rows = slopes, rows
         squares = slopes.squares[rows]

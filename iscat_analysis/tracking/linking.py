@@ -36,14 +36,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 import scipy
-from numpy.typing import NDArray
 
 from iscat_analysis._kernels.moving import link_surely
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.medians import SIGMA_PER_MAD
-from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.records import BoolArray, FloatArray, IntArray
 from iscat_analysis.tracking.field import MovingField
 from iscat_analysis.tracking.rows import (
     BackgroundEstimate,
@@ -51,8 +50,6 @@ from iscat_analysis.tracking.rows import (
     Localizations,
     medians_of_tracks,
 )
-
-IntArray = NDArray[np.int64]
 
 LEAST_SNR = 4.0
 """Signal-to-noise ratio, with its neighbours in place, that a predicted particle needs."""

@@ -22,9 +22,7 @@ from iscat_analysis._kernels.background_response import (
 )
 from iscat_analysis._kernels.canvas import Light
 from iscat_analysis._kernels.moving import Search
-from iscat_analysis.records import BoolArray, FloatArray
-
-IntArray = NDArray[np.int64]
+from iscat_analysis.records import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -65,10 +63,6 @@ class Localizations:
         return Localizations.together(
             [self, Localizations.of(frame, track, theta, group)]
         ).in_order()
-
-    def fitted(self, theta: FloatArray, fisher: FloatArray, gain: FloatArray) -> Localizations:
-        """Set estimates, informations and gains in log-likelihood."""
-        return replace(self, theta=theta, fisher=fisher, snr=np.sqrt(2 * np.maximum(gain, 0.0)))
 
     def starts(self, frames: int) -> IntArray:
         """Index of the first row of each frame, and the number of rows."""
@@ -113,41 +107,13 @@ class Judged:
     fisher: FloatArray
     observed: FloatArray
     bias: FloatArray
+    slopes: Slopes
     gain: FloatArray
     chi2: FloatArray
     pixels: FloatArray
     worst: FloatArray
     level: FloatArray
     growth: FloatArray
-    slopes: Slopes
-
-    @classmethod
-    def of(
-        cls,
-        fisher: FloatArray,
-        turned: FloatArray,
-        ways: FloatArray,
-        bias: FloatArray,
-        numbers: FloatArray,
-        slopes: Slopes,
-        *,
-        free: BoolArray,
-    ) -> Judged:
-        """Make it of the arrays that `iscat_analysis._kernels.track_precision.judge_frames` fills.
-
-        Shapes: `free` (4,).
-        """
-        index = np.flatnonzero(free)
-        part = np.ix_(np.arange(len(fisher)), index, np.arange(index.size))
-        good = np.isfinite(turned[part]).all(axis=(1, 2))
-        square = np.ix_(good, index, index)
-        v, ov = ways[part][good], turned[part][good]
-        o = ov @ np.linalg.inv(v)
-        observed, shift = np.full(fisher.shape, np.nan), np.zeros(bias.shape)
-        observed[square] = (o + np.swapaxes(o, 1, 2)) / 2
-        shift[np.ix_(good, index)] = np.einsum("nik,njk,nj->ni", v, v, bias[good][:, index])
-        gain, chi2, pixels, worst, level, growth = numbers.T
-        return cls(fisher, observed, shift, gain, chi2, pixels, worst, level, growth, slopes)
 
 
 _FARTHEST = 0.05  # step of the logarithm of the background

@@ -17,13 +17,11 @@ from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.records import BoolArray, FloatArray, IntArray
 from iscat_analysis.search.peaks import SAMPLED, maxima, summits
 from iscat_analysis.search.templates import FAR_LOBE, NEAR, SIDELOBE, Templates
 from iscat_analysis.tracking.field import MovingField
 from iscat_analysis.tracking.rows import BackgroundEstimate, Localizations
-
-IntArray = NDArray[np.int64]
 
 _BLOCK = 16  # frames that are searched at a time; more need room that is slow to clear
 

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from iscat_analysis.config import Config
@@ -65,8 +64,6 @@ from iscat_analysis.tracking.linking import (
 )
 from iscat_analysis.tracking.rows import BackgroundEstimate, Judged, Localizations
 from iscat_analysis.tracking.search import FrameCandidates, search_frames
-
-IntArray = NDArray[np.int64]
 
 
 def decide_heights(

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from iscat_analysis.camera import Camera, add_frames, start_power
@@ -44,6 +43,7 @@ from iscat_analysis.records import (
     Film,
     FloatArray,
     FrameSource,
+    IntArray,
     Progress,
     Status,
     TrackStatus,
@@ -60,8 +60,6 @@ from iscat_analysis.species.tracks import (
 from iscat_analysis.threads import one_thread_algebra
 from iscat_analysis.tracking.frames import exposure_of
 from iscat_analysis.units import listed
-
-IntArray = NDArray[np.int64]
 
 FEWEST_PARTICLES = 3
 """Particles in a pair of frames, at least."""
@@ -257,7 +255,7 @@ def tracks_of(
     windows: Windows,
     *,
     masses: pd.DataFrame | None,
-    ticks: NDArray[np.int64] | None,
+    ticks: IntArray | None,
     progress: Progress,
 ) -> tuple[pd.DataFrame, dict[str, Any], list[Finding]]:
     """Describe the tracks of a movie, with entries of its summary and what is found."""
