@@ -174,8 +174,7 @@ def _spots(
         step_energy(before, after, change, chunk.usable, noise, ratio, side, excess, share)
         energy[j] = _smoothed_energy(excess, share, spot_px / side, spot_px)
 
-    for _ in mapper(one, range(count)):
-        pass
+    list(mapper(one, range(count)))
     return [
         _Spot(chunk.first + int(chunk.edges[k + 1]), *(side * c + side // 2 for c in place))
         for k, *place in _maxima(energy, shadow_px / side)

@@ -217,15 +217,13 @@ class Reader:
                 check_counts(frames, low, self.name, camera=self.camera)
 
         if not self._placed:
-            for _ in mapper(read, pieces):
-                pass
+            list(mapper(read, pieces))
         ahead = 1 if begin > start else 0  # the first new frame is compared with the last old one
         part = self._frames(begin - ahead, end)
         light, repeats = measure_frames(part, self.camera, mapper=mapper)
         light[light < self._dark_e] = -np.inf
         lit = np.isfinite(light[ahead:])
-        for _ in mapper(check, pieces):
-            pass
+        list(mapper(check, pieces))
         if not ahead and begin > self.first:  # the frame before is not held
             (earlier,) = self._movie.read(begin - 1, begin)
             repeats[0] = np.array_equal(earlier, part[0])
@@ -260,8 +258,7 @@ class Reader:
         for start in range(0, len(counts), step):
             frames, _ = counts.whole(start, min(start + step, len(counts)))
             lit = good[start : start + step]
-            for _ in pool.map(add, bands, repeat(frames), repeat(lit)):
-                pass
+            list(pool.map(add, bands, repeat(frames), repeat(lit)))
             self._let_go()
         dark = np.count_nonzero(good) * np.asarray(self.camera.offset_adu)
         electrons = self.camera.gain_e_per_adu * (total - dark)

@@ -445,8 +445,7 @@ def measure_frames(
         totals[start : start + len(part) - skip] = sums[skip:]
         repeats[start : start + len(part) - skip] = same[skip:]
 
-    for _ in mapper(some, range(0, len(counts), 64)):
-        pass
+    list(mapper(some, range(0, len(counts), 64)))
     pixels = counts.shape[1] * counts.shape[2]
     maps = np.ndim(camera.gain_e_per_adu) > 0
     if maps:
@@ -627,8 +626,7 @@ def _sum_blocks(
         blocks[k] -= np.count_nonzero(lit) * offset
         blocks[k] *= camera.gain_e_per_adu
 
-    for _ in mapper(one, range(edges.size - 1)):
-        pass
+    list(mapper(one, range(edges.size - 1)))
     return edges, blocks, most
 
 

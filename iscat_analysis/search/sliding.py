@@ -177,8 +177,7 @@ def sliding_maps(
     if in_place:
         _store_behind(one, snr, strides, mapper)
     else:
-        for _ in mapper(stored, changed):
-            pass
+        list(mapper(stored, changed))
     return snr, effective
 
 
