@@ -126,17 +126,16 @@ def landing_particle_images(
             chunk = reader.tile_chunk(sums.part(part.tile.here), part.tile, stride, pool)
         wanted = config.background.follows_pattern
         chunk, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
-        alone, every = find_bright_steps(
+        steps = find_bright_steps(
             chunk,
             window,
             pixel_nm=_pixel_nm(config),
             resolution_nm=config.optics.wavelength_nm / config.optics.na,
             roi_px=_roi_px(config),
-            most=most,
             motion=pattern,
             mapper=pool.map,
         )
-        around = every if rings else ()
+        alone, around = steps.alone(most), steps.every() if rings else ()
         if part.tile is not None:
             found += _in_field(alone, part.tile)
             rest += _in_field(around, part.tile)

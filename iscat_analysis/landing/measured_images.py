@@ -53,12 +53,15 @@ def large_steps(neighbours: Neighbours, mapper: Mapper) -> tuple[list[Step], boo
     if not context.spheres_of(context.model):
         return [], False
     optics = context.config.optics
-    _, bright = find_bright_steps(
-        chunk, neighbours.window, pixel_nm=context.pixel_nm,
+    bright = find_bright_steps(
+        chunk,
+        neighbours.window,
+        pixel_nm=context.pixel_nm,
         resolution_nm=optics.wavelength_nm / optics.na,
-        roi_px=context.roi_px, most=0, mapper=mapper,
-    )  # fmt: skip
-    clear = takewhile(lambda step: step.snr >= BRIGHT_SNR, bright)
+        roi_px=context.roi_px,
+        mapper=mapper,
+    )
+    clear = takewhile(lambda step: step.snr >= BRIGHT_SNR, bright.every())
     nominal, z_range = context.model.material.mass_kda, context.config.fit.z_range_nm
 
     def tried(step: BrightStep) -> list[tuple[int, Likelihood, FitResult]] | None:

@@ -119,11 +119,8 @@ class MovingSearch:
         image = field.residual(ground, rows, here, here + 1)[0] / light
 
         def search(threshold: float) -> pd.DataFrame:
-            with threads(self._config.compute.workers) as pool:
-                found = search_frames(
-                    with_threshold(context, threshold), field, ground, rows,
-                    pool=pool, frames=(here, here + 1),
-                )  # fmt: skip
+            lowered = with_threshold(context, threshold)
+            found = search_frames(lowered, field, ground, rows, (here, here + 1))
             mass = np.asarray(context.model.scale.mass(found.strength))
             each = zip(found.x_px, found.y_px, found.snr, found.z_nm, mass, strict=True)
             return candidate_table(

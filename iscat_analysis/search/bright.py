@@ -126,22 +126,14 @@ def find_bright_steps(
     pixel_nm: float,
     resolution_nm: float,
     roi_px: int,
-    most: int,
     motion: Motion | None = None,
     mapper: Mapper = map,
-) -> tuple[tuple[BrightStep, ...], Iterator[BrightStep]]:
-    """Bright steps that stand alone, and all of them, brightest first, cut when asked for."""
+) -> BrightSteps:
+    """Find the bright steps of a chunk, which are cut when they are asked for."""
     moved = None if motion is None else motion.contrast
     # standard deviation of the spot over λ/NA
     spots = _spots(chunk, 1.0 * resolution_nm / pixel_nm, _SHADOW_NM / pixel_nm, moved, mapper)
-    cuts = _Cuts(chunk, spots, window, pixel_nm, motion)
-    # one after the other: between small kernels threads wait for each other at the interpreter
-    cut = (cuts.of(spot, roi_px, ALONE_NM) for spot in spots[: 4 * most])
-    alone = sorted(islice((step for step in cut if step), most), key=lambda step: -step.snr)
-    # side of the region around a neighbour
-    small = max(5, round(1700.0 / pixel_nm))
-    every = (cuts.of(spot, small, _SHADOW_NM) for spot in spots)
-    return tuple(alone), (step for step in every if step)
+    return BrightSteps(chunk, spots, window, pixel_nm, roi_px, motion)
 
 
 def _spots(
@@ -242,16 +234,28 @@ def _maxima(energy: NDArray[np.floating], shadow_px: float) -> list[tuple[int, i
 
 
 @dataclass(frozen=True)
-class _Cuts:
+class BrightSteps:
     """Steps of a chunk, with the frames around each in which nothing else happens."""
 
     chunk: Chunk
     spots: Sequence[_Spot]
     window: int
     pixel_nm: float
+    roi_px: int
     motion: Motion | None
 
-    def of(self, spot: _Spot, roi_px: int, alone_nm: float) -> BrightStep | None:
+    def alone(self, most: int) -> list[BrightStep]:
+        """Give steps that nothing else is near, the brightest first."""
+        # one after the other: between small kernels threads wait for each other at the interpreter
+        cut = (self._cut(spot, self.roi_px, ALONE_NM) for spot in self.spots[: 4 * most])
+        return sorted(islice(filter(None, cut), most), key=lambda step: -step.snr)
+
+    def every(self) -> Iterator[BrightStep]:
+        """Give all steps, the brightest first, in the small region that a neighbour needs."""
+        side = max(5, round(1700.0 / self.pixel_nm))
+        return filter(None, (self._cut(spot, side, _SHADOW_NM) for spot in self.spots))
+
+    def _cut(self, spot: _Spot, roi_px: int, alone_nm: float) -> BrightStep | None:
         """Date a step and sum the frames before and after it; None if these are too few."""
         chunk, frame, gap = self.chunk, spot.frame, 0
         low, high = self._quiet(spot, alone_nm)

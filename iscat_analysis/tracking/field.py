@@ -51,7 +51,7 @@ from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.optics.model import blurred, spreads
 from iscat_analysis.optics.stamp import BAND, RINGS, sample_picture, weights_between
 from iscat_analysis.optics.waves import axial_table
-from iscat_analysis.records import BoolArray, FloatArray, IntArray
+from iscat_analysis.records import BoolArray, FloatArray, IntArray, Mapper
 from iscat_analysis.tracking.rows import BackgroundEstimate, Judged, Localizations, Response
 
 
@@ -270,6 +270,11 @@ class MovingField:
         total = counts.sum(axis=(1, 2), dtype=np.float64)
         total -= counts[:, ~self.used].sum(axis=1, dtype=np.float64)
         return self.exposures.in_electrons(total, int(self.used.sum()))
+
+    @property
+    def mapper(self) -> Mapper:
+        """`map` in threads."""
+        return self._pool.map
 
     @property
     def frames(self) -> int:
@@ -502,13 +507,13 @@ class MovingField:
         """Run a function on blocks of frames and sum the results in order."""
         firsts = range(0, self.frames if frames is None else frames, at_once)
         total: FloatArray = np.zeros(())
-        for part in self._pool.map(block, firsts):
+        for part in self.mapper(block, firsts):
             total = total + part.astype(np.float64)
         return total
 
     def share(self, task: Callable[[int], None], count: int) -> None:
         """Run numbered tasks in threads."""
-        list(self._pool.map(task, range(count)))
+        list(self.mapper(task, range(count)))
 
     def holds(self, theta: FloatArray) -> BoolArray:
         """Tell which positions are in the field.

@@ -9,7 +9,6 @@ is not theirs alone yet: the sign of the contrast is the model's.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -189,7 +188,6 @@ def search_frames(
     field: MovingField,
     ground: BackgroundEstimate,
     rows: Localizations,
-    pool: ThreadPoolExecutor,
     frames: tuple[int, int] | None = None,
     *,
     enough: int = 0,
@@ -215,8 +213,9 @@ def search_frames(
 
     blocks = range(begin, end, _BLOCK)
     sample = blocks[:: _SAMPLED if enough else 1]
-    parts = dict(zip(sample, pool.map(block, sample), strict=True))
+    mapper = field.mapper if frames is None else map
+    parts = dict(zip(sample, mapper(block, sample), strict=True))
     if sum(len(part.frame) for part in parts.values()) > enough / _SAMPLED:
         others = [first for first in blocks if first not in parts]
-        parts |= zip(others, pool.map(block, others), strict=True)
+        parts |= zip(others, mapper(block, others), strict=True)
     return FrameCandidates.together(parts[first] for first in sorted(parts))

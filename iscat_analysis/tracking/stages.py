@@ -280,7 +280,6 @@ def search(task: Task, state: State) -> State:
             task.field,
             state.ground,
             state.rows,
-            task.recording.pool,
             enough=round(_FEW * before) if number >= _FULL else 0,
             cautious=task.cautious,
         )

@@ -25,17 +25,17 @@ def _ring(y_px: float, x_px: float, contrast: float) -> FloatArray:
     return np.asarray(contrast * (r**2 - 0.3 * r**4) * np.exp(-(r**2)))
 
 
-def _steps(events: list[tuple[int, float, float, float]], seed: int) -> tuple[BrightStep, ...]:
+def _steps(events: list[tuple[int, float, float, float]], seed: int) -> list[BrightStep]:
     random = np.random.default_rng(seed)
     speckle = LEVEL * random.uniform(0.7, 1.3, (ROWS, COLUMNS))
     expected = np.broadcast_to(speckle, (FRAMES, ROWS, COLUMNS)).copy()
     for frame, y, x, contrast in events:
         expected[frame:] *= 1 + _ring(y, x, contrast)
     counts = random.poisson(expected).astype(np.uint16)
-    alone, _ = find_bright_steps(
-        _chunk(counts), WINDOW, pixel_nm=PIXEL_NM, resolution_nm=370.0, roi_px=20, most=20
+    steps = find_bright_steps(
+        _chunk(counts), WINDOW, pixel_nm=PIXEL_NM, resolution_nm=370.0, roi_px=20
     )
-    return alone
+    return steps.alone(20)
 
 
 def _chunk(counts: np.ndarray) -> Chunk:  # type: ignore[type-arg]
