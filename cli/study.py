@@ -122,13 +122,28 @@ class Repeated:
     workers: Count = None
 
 
+@dataclass(frozen=True)
+class Own:
+    """One's own simulation.
+
+    Options
+    -------
+    --truth T.csv
+        Its truth, one row a particle.
+    --results R.csv
+        Estimates of it, to be scored.
+    """
+
+    truth: Path | None = None
+    results: Path | None = None
+
+
 @command
 def benchmark(
     messages: Messages,
     *,
     list_: bool = False,
-    truth: Path | None = None,
-    results: Path | None = None,
+    own: Own,
     repeated: Repeated,
     estimators: Estimators,
     setup: Setup,
@@ -146,10 +161,6 @@ def benchmark(
         Configuration; [bounds] describes the experiment.
     --list
         Print the estimators that can be named.
-    --truth T.csv
-        Truth of one's own simulation, one row a particle.
-    --results R.csv
-        Estimates of it, to be scored.
 
     Example: a thousand repetitions of one experiment; then the estimators
     that can be named, and your own simulation compared with the bounds.
@@ -169,12 +180,12 @@ def benchmark(
         raise ConfigError("--config is missing: give the configuration of the experiment")
     resolved = setup.load()
 
-    if truth is not None or results is not None:
-        if truth is None or results is None:
+    if own.truth is not None or own.results is not None:
+        if own.truth is None or own.results is None:
             raise ConfigError("--truth and --results belong together: give both")
         from iscat_contest.scoring import score_own
 
-        scores = score_own(truth, results, resolved, command=messages.command)
+        scores = score_own(own.truth, own.results, resolved, command=messages.command)
         _publish(messages, scores, estimators.archive, output)
         return
     if output.out is None:
@@ -242,15 +253,33 @@ def benchmark_table(study: Mapping[str, Any]) -> Table:
     )
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """What is drawn for a challenge.
+
+    Options
+    -------
+    --preset
+        easy: one particle in each stack; realistic: landing movies; hard: the same under an
+        unknown microscope; dong2021: the set-ups of that paper.
+    --stacks N
+        Stacks, with --config.
+    --seed N
+        Same seed, same bytes; default 1.
+    """
+
+    preset: Literal["easy", "realistic", "hard", "dong2021"] | None = None
+    stacks: Annotated[int, typer.Option(min=1, max=9999)] = 100
+    seed: Seed = None
+
+
 @command
 def make(
     messages: Messages,
     *,
     out: Path,
-    preset: Literal["easy", "realistic", "hard", "dong2021"] | None = None,
     blind: bool = False,
-    stacks: Annotated[int, typer.Option(min=1, max=9999)] = 100,
-    seed: Seed = None,
+    drawn: Drawn,
     setup: Setup,
     overwrite: bool = False,
 ) -> None:
@@ -262,17 +291,10 @@ def make(
     -------
     --out DIR
         The challenge.
-    --preset
-        easy: one particle in each stack; realistic: landing movies; hard: the same under an
-        unknown microscope; dong2021: the set-ups of that paper.
     --config C.toml
         In place of a preset: stacks of [bounds], and a movie of [simulation].
     --blind
         Draw a secret seed, and keep the truth beside the folder, DIR.truth.json.
-    --stacks N
-        Stacks, with --config.
-    --seed N
-        Same seed, same bytes; default 1.
     --overwrite
         Replace earlier output.
 
@@ -282,20 +304,26 @@ def make(
     """
     from iscat_analysis.errors import ConfigError
 
-    if (preset is None) == (not setup.config):
+    if (drawn.preset is None) == (not setup.config):
         raise ConfigError("give --preset or --config, one of them")
-    if preset is not None and setup.set_:
+    if drawn.preset is not None and setup.set_:
         raise ConfigError("--set changes a configuration: give --config, and no --preset")
     from iscat_contest.challenge import make_challenge, parts_of_config, preset_parts, truth_beside
 
-    if preset is not None:
-        parts, name = preset_parts(preset), str(preset)
+    if drawn.preset is not None:
+        parts, name = preset_parts(drawn.preset), str(drawn.preset)
     else:
-        parts = parts_of_config(setup.load(), stacks)
+        parts = parts_of_config(setup.load(), drawn.stacks)
         name = "-".join(path.stem for path in setup.config or ())
     with messages.progress() as progress:
         manifest = make_challenge(
-            parts, out, name=name, seed=seed, blind=blind, overwrite=overwrite, progress=progress
+            parts,
+            out,
+            name=name,
+            seed=drawn.seed,
+            blind=blind,
+            overwrite=overwrite,
+            progress=progress,
         )
     files = sum(name.endswith(".tif") for name in manifest["files"])
     where = truth_beside(out).name if blind else "truth.json"
