@@ -5,6 +5,7 @@ from __future__ import annotations
 from iscat_analysis.camera.background import (
     Check,
     add_frames,
+    find_defects,
     measure_windows,
     refine_power,
     smooth_background,
@@ -57,7 +58,6 @@ from iscat_analysis.camera.learned import (
 )
 from iscat_analysis.camera.light import LightModel, PartOfLight, SteadyFrames, with_lines
 from iscat_analysis.camera.light_search import find_light
-from iscat_analysis.camera.moments import find_defects
 from iscat_analysis.camera.pixels import (
     find_unsteady,
     text_finding,

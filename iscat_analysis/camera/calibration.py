@@ -28,6 +28,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from iscat_analysis.camera.background import unlike_neighbours
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.moments import (
     KINDS,
@@ -39,7 +40,6 @@ from iscat_analysis.camera.moments import (
     moments_of,
     saturated,
     stand_out,
-    unlike_neighbours,
     unsteady,
 )
 from iscat_analysis.camera.regression import (

@@ -30,8 +30,8 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
+from iscat_analysis.camera.background import find_defects
 from iscat_analysis.camera.counts import Camera, float_type
-from iscat_analysis.camera.moments import find_defects
 from iscat_analysis.camera.spectrum import measure_spectrum
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings import camera as of

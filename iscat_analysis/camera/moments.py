@@ -13,9 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter, minimum_filter
 
 from iscat_analysis.camera.counts import Camera, full_scale_of
 from iscat_analysis.errors import DataError
@@ -141,13 +139,6 @@ def moments_of(
 KINDS = ("saturated", "clipped", "dead", "hot")
 """What may be wrong with a pixel."""
 
-DEAD, HOT = 0.2, 5.0
-"""A pixel below or above these multiples of the median of its neighbours is left out."""
-
-DEFECT_SIGMAS = 6.0
-"""Unless noise alone could have put it there: dark backgrounds scatter by more than their mean."""
-
-_NEIGHBOURS = 5  # pixels along each side, whose median tells what a pixel should hold
 _OUTLIER_SIGMAS = 8.0
 
 
@@ -164,47 +155,6 @@ def saturated(highest: NDArray[Any], name: str) -> BoolArray:
             "lower the exposure or the laser power"
         )
     return full
-
-
-def find_defects(before_e: FloatArray, read_variance_e2: FloatArray) -> BoolArray:
-    """Find dead and hot pixels: far from the median of their neighbours, beyond noise.
-
-    Shapes: `before_e` (y, x), `read_variance_e2` (y, x), result (y, x).
-    """
-    local = _usual(before_e)
-    off = (before_e < DEAD * local) | (before_e > HOT * local)
-    # Anscombe's transform makes the noise 1 at every level, a few counts included.
-    steady, expected = (
-        2 * np.sqrt(np.maximum(counts + 0.375 + read_variance_e2, 0.0))
-        for counts in (before_e, local)
-    )
-    return np.asarray(off & (np.abs(steady - expected) > DEFECT_SIGMAS))
-
-
-def unlike_neighbours(light: FloatArray) -> tuple[BoolArray, BoolArray]:
-    """Find pixels that are far darker, and such that are far brighter, than their neighbours.
-
-    Shapes: `light` (y, x), results (y, x).
-    """
-    local = _usual(light)
-    return (light < DEAD * local) & (local > 0), (light > HOT * local) & (local > 0)
-
-
-def _usual(light: FloatArray) -> FloatArray:
-    """Median of the neighbours of pixels that may be far from it; the others as they are.
-
-    A median lies between the lowest and the highest of its neighbours, which are found sooner.
-    """
-    lowest, highest = (
-        np.maximum(extreme(light, size=_NEIGHBOURS, mode="nearest"), 0.0)
-        for extreme in (minimum_filter, maximum_filter)
-    )
-    doubtful = (light < DEAD * highest) | (light > HOT * lowest)
-    padded = np.pad(light, _NEIGHBOURS // 2, mode="edge")
-    around = sliding_window_view(padded, (_NEIGHBOURS, _NEIGHBOURS))[doubtful]
-    usual = light.copy()
-    usual[doubtful] = np.maximum(np.median(around.reshape(-1, _NEIGHBOURS**2), axis=1), 0.0)
-    return usual
 
 
 def clipped(lowest: NDArray[Any]) -> BoolArray:

@@ -36,15 +36,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis.camera.background import unlike_neighbours
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.moments import (
-    Moments,
-    brightness_bins,
-    moments_of,
-    stand_out,
-    unlike_neighbours,
-    unsteady,
-)
+from iscat_analysis.camera.moments import Moments, brightness_bins, moments_of, stand_out, unsteady
 from iscat_analysis.camera.regression import (
     LEAST_RELIABILITY,
     Estimate,

@@ -4,12 +4,12 @@ Microscope, particle and camera; arrays to broadcast; counts before and after, o
 regions, and the likelihood of each.
 """
 
-from __future__ import annotations
+# Annotations are evaluated: the declarations of keywords are read when the program runs.
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Unpack
+from typing import Annotated, Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,9 +39,82 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.optics.model import collected_area_nm2, photons_per_intensity
 from iscat_analysis.options import takes
-from iscat_analysis.pieces.groups import ImageOptions
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray
 from iscat_analysis.units import count
+
+Array = Annotated["ArrayLike | None", "Optional."]
+Frames = Annotated[int | None, "Optional."]
+Line = Annotated["Calibration | None", "Optional."]
+Mode = Annotated[str, "Which parameters are free.", "", "mass"]
+Place = Annotated["ArrayLike", "From the centre [nm].", "", 0.0]
+
+
+class LightOptions(TypedDict, total=False):
+    """Light of the frames before and after, and pixels to leave out."""
+
+    n_before: Frames
+    n_after: Frames
+    power_ratio: Array
+    level: Annotated[bool | None, "Optional."]
+    masked: Array
+
+
+class ImageOptions(LightOptions, total=False):
+    """Counts or contrast images of many regions."""
+
+    contrast: Array
+    sigma: Array
+    saturated: Array
+
+
+class ModelOptions(TypedDict, total=False):
+    """Which parameters of a particle are free, and its scale."""
+
+    mode: Mode
+    z_range_nm: Annotated[tuple[float, float], "Heights [nm].", "", (0.0, 1000.0)]
+    calibration: Line
+
+
+class LikelihoodOptions(LightOptions, ModelOptions, total=False):
+    """The likelihood of one region."""
+
+
+class FitOptions(ImageOptions, ModelOptions, total=False):
+    """Fits of many regions."""
+
+    corners_px: Array
+    workers: Annotated[int, "Number of threads.", "", 1]
+
+
+class ParticleOptions(TypedDict, total=False):
+    """A particle, and its scale."""
+
+    z_nm: Array
+    mass_kda: Array
+    calibration: Line
+
+
+class SquareOptions(ParticleOptions, total=False):
+    """A square image of a particle."""
+
+    pixels: Annotated[int, "Side of the image.", "", 33]
+    x_nm: Place
+    y_nm: Place
+
+
+class QuantumOptions(ParticleOptions, total=False):
+    """A measurement of a particle."""
+
+    n_after: Annotated["ArrayLike", "Frames with the particle.", "", 1]
+    mode: Mode
+    focus_nm: Array
+
+
+class BoundOptions(SquareOptions, QuantumOptions, total=False):
+    """A measurement with a camera."""
+
+    n_before: Annotated["ArrayLike", "Frames of background.", "", 0]
+
 
 LARGEST_REGION = 1500
 """Pixels along a side of a region, whose bounds take half a gigabyte."""

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from iscat_analysis.bounds import event_bounds, quantum_bounds, quantum_information
 from iscat_analysis.bounds.experiment import expected_likelihood
-from iscat_analysis.config import CameraConfig, Config, Optics, Particle
+from iscat_analysis.config import CameraConfig, Optics, Particle
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import number_in, truth_in
 from iscat_analysis.inference.likelihood import LEVEL
@@ -23,8 +23,15 @@ from iscat_analysis.optics.model import collected_area_nm2, photons_per_intensit
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.optics.scatterers import ANGLES, Rod
 from iscat_analysis.options import takes
-from iscat_analysis.pieces.counts import LARGEST_REGION, config_of, darkfield_photons, together
-from iscat_analysis.pieces.groups import BoundOptions, QuantumOptions, SquareOptions
+from iscat_analysis.pieces.counts import (
+    LARGEST_REGION,
+    BoundOptions,
+    QuantumOptions,
+    SquareOptions,
+    config_of,
+    darkfield_photons,
+    together,
+)
 from iscat_analysis.records import PARAMETERS, FloatArray
 
 
@@ -84,10 +91,11 @@ def psf(
     config = config_of(optics, particle, camera, mode=mode, calibration=options["calibration"])
     side = int(number_in("pixels", options["pixels"], least=1, most=LARGEST_REGION, whole=True))
     pixel_nm = float(config.camera.pixel_size_nm or 0.0)
-    usual = _usual_place(config, forward_model(config, pixel_nm))
+    z_nm, mass_kda = options["z_nm"], options["mass_kda"]
     given = {"x_nm": options["x_nm"], "y_nm": options["y_nm"]}
-    given["z_nm"] = _either(options["z_nm"], usual["z_nm"])
-    given["mass_kda"] = _either(options["mass_kda"], usual["mass_kda"])
+    given["z_nm"] = particle.nominal_height_nm if z_nm is None else z_nm
+    nominal = forward_model(config, pixel_nm).material.mass_kda
+    given["mass_kda"] = nominal if mass_kda is None else mass_kda
     at = together(given, least={"z_nm": 0.0})
     half = side * pixel_nm / 2
     reach = math.hypot(*(half + np.abs(at[name]).max(initial=0.0) for name in ("x_nm", "y_nm")))
@@ -300,16 +308,6 @@ class _At:
 _LEAST = {"z_nm": 0.0, "photons_per_pixel": 0.0, "n_after": 1.0, "n_before": 0.0}
 
 
-def _usual_place(config: Config, model: ForwardModel) -> dict[str, float]:
-    """Give height, mass and focus where none are given."""
-    height, focus = config.particle.nominal_height_nm, config.optics.focus_nm
-    return {"z_nm": height, "mass_kda": model.material.mass_kda, "focus_nm": focus}
-
-
-def _either(given: ArrayLike | None, usual: float) -> ArrayLike:
-    return usual if given is None else given
-
-
 class _Setups:
     """Broadcast set-ups; models are shared between those of one focus."""
 
@@ -326,9 +324,14 @@ class _Setups:
         # a calibration was measured at the focus of `optics`, not at the focus of the set-up
         nominal = forward_model(config, self._pixel_nm)
         self._scale = nominal.scale
-        usual = _usual_place(config, nominal)
-        whole = {name: given[name] for name in ("x_nm", "y_nm", *_LEAST)}
-        whole |= {name: _either(given[name], value) for name, value in usual.items()}
+        usual = {
+            "z_nm": config.particle.nominal_height_nm,
+            "mass_kda": nominal.material.mass_kda,
+            "focus_nm": config.optics.focus_nm,
+        }
+        names = {"x_nm", "y_nm", *_LEAST, *usual}
+        whole: dict[str, Any] = {k: usual.get(k) for k in names}
+        whole |= {k: given[k] for k in sorted(names) if given[k] is not None}
         self._all = together(whole, least=_LEAST)
         for name in ("n_after", "n_before"):
             broken = self._all[name] != np.round(self._all[name])

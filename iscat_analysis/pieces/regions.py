@@ -21,13 +21,15 @@ from iscat_analysis.inference.heights import has_prior, height_prior
 from iscat_analysis.inference.likelihood import LARGEST_LEVEL, LEVEL, Likelihood
 from iscat_analysis.optics.sized import SeatedModel, SizedModel
 from iscat_analysis.options import only, takes
-from iscat_analysis.pieces.counts import Counts, config_of, gather
-from iscat_analysis.pieces.groups import (
+from iscat_analysis.pieces.counts import (
+    Counts,
     FitOptions,
     ImageOptions,
     LightOptions,
     LikelihoodOptions,
     ModelOptions,
+    config_of,
+    gather,
 )
 from iscat_analysis.records import (
     FREE_PARAMETERS,
@@ -156,9 +158,8 @@ def fit_rois(
     >>> abs(table.mass_kda[0] - 480) < 4 * table.sigma_mass_kda[0]
     np.True_
     """
-    model: Any = only(ModelOptions, options)
-    config = _of_frames(config_of(optics, particle, camera, **model))
-    refuse_rod(config, "its direction has to be fitted too")
+    setup = optics, particle, camera
+    config = _round_particles("its direction has to be fitted too", options, *setup)
     counts = gather(config, before, after, **only(ImageOptions, options))
     count = len(counts.after)
     corners_px = options["corners_px"]
@@ -178,10 +179,12 @@ def fit_rois(
     return flagged(table, Status.UNCALIBRATED_OPTICS) if refused else table
 
 
-def _of_frames(config: Config) -> Config:
-    """Refuse the mode that is of tracks."""
+def _round_particles(what: str, options: Any, *setup: Any) -> Config:
+    """Put a set-up together; refuse the mode that is of tracks, and rods."""
+    config = config_of(*setup, **only(ModelOptions, options))
     if config.fit.follows_tracks:
         raise ConfigError('mode = "track" links frames: give "joint", frame by frame')
+    refuse_rod(config, what)
     return config
 
 
@@ -573,9 +576,8 @@ def log_likelihood(
     >>> bool(logl(at) > logl([900.0, 844.0, 48_700.0])), logl.gradient(at).shape
     (True, (3,))
     """
-    model_of: Any = only(ModelOptions, options)
-    config = _of_frames(config_of(optics, particle, camera, **model_of))
-    refuse_rod(config, "the angles are no parameters of log_likelihood")
+    what = "the angles are no parameters of log_likelihood"
+    config = _round_particles(what, options, optics, particle, camera)
     image, known = real_array("after", after), real_array("before", before)
     if image.ndim != 2:
         raise DataError(f"after: has shape {image.shape}; give one region as (y, x)")

@@ -27,8 +27,7 @@ from iscat_analysis.inference.sizes import AMBIGUITY_ODDS
 from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.optics.scatterers import Rod, rod_of
 from iscat_analysis.options import takes
-from iscat_analysis.pieces.counts import config_of, gather
-from iscat_analysis.pieces.groups import LightOptions
+from iscat_analysis.pieces.counts import LightOptions, config_of, gather
 from iscat_analysis.pieces.regions import EDGE_SHARE
 from iscat_analysis.records import Box, FloatArray, Status, verdict
 

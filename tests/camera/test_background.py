@@ -14,7 +14,7 @@ from iscat_analysis.camera import (
     refine_power,
     smooth_background,
 )
-from iscat_analysis.camera.moments import DEAD, DEFECT_SIGMAS, HOT
+from iscat_analysis.camera.background import DEAD, DEFECT_SIGMAS, HOT
 from iscat_analysis.config import BackgroundConfig
 from iscat_analysis.errors import DataError
 
