@@ -329,9 +329,8 @@ class _Setups:
             "mass_kda": nominal.material.mass_kda,
             "focus_nm": config.optics.focus_nm,
         }
-        names = {"x_nm", "y_nm", *_LEAST, *usual}
-        whole: dict[str, Any] = {k: usual.get(k) for k in names}
-        whole |= {k: given[k] for k in sorted(names) if given[k] is not None}
+        names = ("x_nm", "y_nm", "mass_kda", "focus_nm", *_LEAST)
+        whole: dict[str, Any] = {k: usual.get(k) if given[k] is None else given[k] for k in names}
         self._all = together(whole, least=_LEAST)
         for name in ("n_after", "n_before"):
             broken = self._all[name] != np.round(self._all[name])
