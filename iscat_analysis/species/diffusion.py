@@ -23,7 +23,7 @@ bias of order 1/n (Cox & Snell, J. R. Stat. Soc. B 30, 248, 1968), is zero: noth
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -44,7 +44,6 @@ _RATES_HZ = (1e-6, 1e9)
 _LENGTHS_NM = (1e-6, 1e9)  # the smallest error and the largest place
 _MOST_RATIO = 1e5  # of the errors of a track; their squares must not drown in one another
 _MOST_FRAMES = 2**53  # beyond, not every frame has a number of its own
-_OF_TIMES = ("gaps_s", "linked", "error", "rate")  # and of errors alone, of `Displacements`
 _ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this share
 
 
@@ -98,18 +97,27 @@ class Displacements:
         blur = self.exposure_s / 3
         return 2 * (self.gaps_s - blur), np.where(self.linked, blur, 0.0)
 
-    def moved(self, positions_nm: FloatArray) -> Displacements:
-        """Replace the positions; frames and errors stay.
-
-        Shapes: `positions_nm` (c, n).
-        """
-        track = replace(self, positions_nm=positions_nm)
-        vars(track).update({name: getattr(self, name) for name in _OF_TIMES})
-        return track
-
     def likelihood(self, d_nm2_s: float) -> Likelihood:
         """Log-likelihood of free diffusion."""
         return Likelihood(*displacement_likelihood(self.steps_nm, *self.error, *self.rate, d_nm2_s))
+
+    @cached_property
+    def best_nm2_s(self) -> float:
+        """D of highest likelihood [nm²/s]."""
+        scale = float(np.mean(self.steps_nm**2 / self.rate[0]))
+        scale = scale or float(np.mean(self.error[0] / self.rate[0]))
+        return float(most_likely_diffusion(self.steps_nm, *self.error, *self.rate, scale))
+
+    @cached_property
+    def best(self) -> Likelihood:
+        """The likelihood at its maximum."""
+        return self.likelihood(self.best_nm2_s)
+
+    def estimate(self) -> tuple[float, float]:
+        """D and its standard error, as `fit_diffusion` gives them [µm²/s]."""
+        curved = self.best_nm2_s > 0 and self.best.curvature < 0
+        information = -self.best.curvature if curved else self.best.information
+        return self.best_nm2_s / NM2_PER_UM2, information**-0.5 / NM2_PER_UM2
 
 
 def gather(
@@ -125,33 +133,27 @@ def gather(
 
     Shapes: `frames` (n,), `positions_nm` (n,) or (n, c).
     """
-    rate = real_array("frame_rate_hz", frame_rate_hz)
-    if rate.ndim or not _RATES_HZ[0] <= rate <= _RATES_HZ[1]:
-        raise ConfigError(
-            f"frame_rate_hz = {frame_rate_hz!r}: give one number of frames per second between "
-            f"{_RATES_HZ[0]:g} and {_RATES_HZ[1]:g}"
-        )
-    interval = 1 / float(rate)
-    exposure = interval
+    (slowest, fastest), (least, most) = _RATES_HZ, _LENGTHS_NM
+    rate = number_in(
+        "frame_rate_hz", frame_rate_hz, least=slowest, most=fastest,
+        what="number of frames per second",
+    )  # fmt: skip
+    interval = exposure = 1 / rate
     if exposure_ms is not None:
-        given = real_array("exposure_ms", exposure_ms)
-        if given.ndim or not (np.isfinite(given) and given >= 0):
-            raise ConfigError(f"exposure_ms = {exposure_ms!r}: give one number of at least 0")
-        exposure = float(given) / 1e3
-        if exposure > interval * (1 + _ROUNDING):
-            raise ConfigError(
-                f"exposure_ms = {exposure_ms:g} is longer than the {1e3 * interval:g} ms from "
-                f"frame to frame at frame_rate_hz = {frame_rate_hz:g}: correct one of them"
-            )
+        exposure = number_in("exposure_ms", exposure_ms, least=0.0) / 1e3
+    if exposure > interval * (1 + _ROUNDING):
+        raise ConfigError(
+            f"exposure_ms = {exposure_ms:g} is longer than the {1e3 * interval:g} ms from "
+            f"frame to frame at frame_rate_hz = {frame_rate_hz:g}: correct one of them"
+        )
     when = real_array("frames", frames)
     if when.ndim != 1 or when.size < LEAST_POSITIONS:
         raise DataError(
             f"frames: has shape {when.shape}; give the frame number of each of at least "
             f"{LEAST_POSITIONS} positions"
         )
-    whole = np.isfinite(when).all() and (np.abs(when) < _MOST_FRAMES).all()
-    whole = whole and (when == np.round(when)).all()
-    if not whole or not (np.diff(when) > 0).all():
+    whole = (np.abs(when) < _MOST_FRAMES) & (when == np.round(when))
+    if not whole.all() or not (np.diff(when) > 0).all():
         raise DataError(
             "frames: give whole numbers that increase, each frame once; frames without a position "
             "are left out"
@@ -170,26 +172,22 @@ def gather(
             f"sigma_nm: has shape {errors.shape}; give one number, ({when.size},) or "
             f"{places.shape} as positions_nm has"
         )
-    for name, array in (("positions_nm", places), ("sigma_nm", columns)):
-        if not np.isfinite(array).all():
-            raise DataError(f"{name}: is not finite everywhere; leave such frames out")
-    least, most = _LENGTHS_NM
-    if np.abs(places).max() > most:
-        raise DataError(f"positions_nm = {places.flat[np.abs(places).argmax()]:g}: give nanometres")
-    wrong = (columns < least) | (columns > most)
-    if wrong.any():
-        raise DataError(
-            f"sigma_nm = {columns[wrong].flat[0]:g}: give the standard error of each position in "
-            f"nanometres, at least {least:g}"
-        )
+    for name, array, low, what in (
+        ("positions_nm", places, -most, "each position"),
+        ("sigma_nm", columns, least, "the standard error of each position"),
+    ):
+        wrong = ~((array >= low) & (array <= most))
+        if wrong.any():
+            raise DataError(
+                f"{name} = {array[wrong].flat[0]:g}: give {what} in nanometres, between {low:g} "
+                f"and {most:g}; leave frames without one out"
+            )
     if columns.max() > _MOST_RATIO * columns.min():
         raise DataError(
             f"sigma_nm: goes from {columns.min():g} to {columns.max():g} nm; leave out positions "
             "that say nothing beside the others"
         )
-    variance = np.broadcast_to(columns**2, places.shape).T
-    every = np.ones(when.size - 1, dtype=bool)
-    going = every if counted is None else array_of("counted", counted)
+    going = np.ones(when.size - 1, bool) if counted is None else array_of("counted", counted)
     if going.shape != (when.size - 1,) or going.dtype != bool:
         raise DataError(
             f"counted: has shape {going.shape} of {going.dtype}; give ({when.size - 1},) of bool, "
@@ -201,7 +199,7 @@ def gather(
         )
     return Displacements(
         positions_nm=np.ascontiguousarray(places.T),
-        variance_nm2=np.ascontiguousarray(variance),
+        variance_nm2=np.ascontiguousarray(np.broadcast_to(columns**2, places.shape).T),
         frames=when.astype(np.int64),
         interval_s=interval,
         exposure_s=min(exposure, interval),
@@ -319,48 +317,27 @@ def fit_diffusion(
     )  # fmt: skip
     if not 0 < number_in("level", level) < 1:
         raise ConfigError(f"level = {level!r}: give a coverage between 0 and 1")
-    best, sigma, crb, log_likelihood = _estimated(track)
-    other, other_sigma = covariance_based(track, best)
+    return diffusion_of(track, float(level))
+
+
+def diffusion_of(track: Displacements, level: float) -> Diffusion:
+    """Fit the diffusion coefficient of a track that is checked."""
+    (best, sigma), crb = track.estimate(), track.best.information**-0.5 / NM2_PER_UM2
+    other, other_sigma = (each / NM2_PER_UM2 for each in covariance_based(track, track.best_nm2_s))
+    low, high = (end / NM2_PER_UM2 for end in _interval(track, level))
     spare = other_sigma**2 - crb**2
     return Diffusion(
-        d_um2_s=best / NM2_PER_UM2,
-        sigma_d_um2_s=sigma / NM2_PER_UM2,
-        crb_d_um2_s=crb / NM2_PER_UM2,
-        interval_um2_s=tuple(end / NM2_PER_UM2 for end in _interval(track, best, level)),  # type: ignore[arg-type]
-        level=float(level),
-        log_likelihood=log_likelihood,
+        d_um2_s=best,
+        sigma_d_um2_s=sigma,
+        crb_d_um2_s=crb,
+        interval_um2_s=(low, high),
+        level=level,
+        log_likelihood=track.best.value,
         n_positions=track.counted.size + 1,
-        covariance_d_um2_s=other / NM2_PER_UM2,
-        covariance_sigma_d_um2_s=other_sigma / NM2_PER_UM2,
+        covariance_d_um2_s=other,
+        covariance_sigma_d_um2_s=other_sigma,
         disagreement=(other - best) / math.sqrt(spare) if spare > 0 else math.nan,
     )
-
-
-def estimate_diffusion(
-    frames: ArrayLike,
-    positions_nm: ArrayLike,
-    sigma_nm: ArrayLike,
-    *,
-    frame_rate_hz: float,
-    exposure_ms: float | None = None,
-    counted: ArrayLike | None = None,
-) -> tuple[float, float]:
-    """D of one track and its standard error, as in `fit_diffusion`, and nothing else."""
-    track = gather(
-        frames, positions_nm, sigma_nm,
-        frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms, counted=counted,
-    )  # fmt: skip
-    best, sigma, *_ = _estimated(track)
-    return best / NM2_PER_UM2, sigma / NM2_PER_UM2
-
-
-def _estimated(track: Displacements) -> tuple[float, float, float, float]:
-    """D of highest likelihood, its standard error, the bound there [nm²/s], and the likelihood."""
-    best = most_likely(track)
-    there = track.likelihood(best)
-    crb = 1 / math.sqrt(there.information)
-    sigma = 1 / math.sqrt(-there.curvature) if best > 0 and there.curvature < 0 else crb
-    return best, sigma, crb, there.value
 
 
 def hydrodynamic_diameter(
@@ -422,35 +399,23 @@ def hydrodynamic_diameter(
     return np.asarray(diameter), np.asarray(error)
 
 
-def most_likely(track: Displacements) -> float:
-    """Maximise the likelihood of free diffusion."""
-    scale = float(np.mean(track.steps_nm**2 / track.rate[0])) or float(
-        np.mean(track.error[0] / track.rate[0])
-    )
-    return float(most_likely_diffusion(track.steps_nm, *track.error, *track.rate, scale))
-
-
-def _interval(track: Displacements, best: float, level: float) -> tuple[float, float]:
+def _interval(track: Displacements, level: float) -> tuple[float, float]:
     """Find where the root of the likelihood ratio, nearly a line, has its critical value."""
-    zero, there = track.likelihood(0.0), track.likelihood(best)
-    peak = there.value
+    zero, best, step = track.likelihood(0.0), track.best_nm2_s, track.best.information**-0.5
 
     def beyond(d: float) -> float:
         there = track.likelihood(d)
         gained = d * zero.log_determinant_slope - (there.log_determinant - zero.log_determinant)
-        deviation = math.sqrt(2 * max(peak - there.value, 0.0))
+        deviation = math.sqrt(2 * max(track.best.value - there.value, 0.0))
         return deviation - critical_value(math.sqrt(max(gained, 0.0)), level)
 
-    step = 1 / math.sqrt(there.information)
     high = best + step
     while beyond(high) < 0:
         step *= 2
         high += step
-    upper = float(scipy.optimize.brentq(beyond, best, high))
-    lower = (
-        0.0 if best == 0 or beyond(0.0) <= 0 else float(scipy.optimize.brentq(beyond, 0.0, best))
-    )
-    return lower, upper
+    excludes_zero = best > 0 and beyond(0.0) > 0
+    lower = float(scipy.optimize.brentq(beyond, 0.0, best)) if excludes_zero else 0.0
+    return lower, float(scipy.optimize.brentq(beyond, best, high))
 
 
 def critical_value(mu: float, level: float) -> float:
@@ -477,29 +442,20 @@ def covariance_based(track: Displacements, d_nm2_s: float) -> tuple[float, float
     σ_k² + σ_{k+1}² of a square is what its two products take off, and so is the blur.  The sum
     d·Q·d has the variance 2 tr (QΣ)².
     """
-    steps = track.steps_nm
     diagonal = np.zeros(track.gaps_s.size)
     diagonal[1:-1] = track.linked[1:] & track.linked[:-1]
     if not diagonal.any():
         return math.nan, math.nan
-    off_diagonal = np.where(track.linked, 0.5 * (diagonal[1:] + diagonal[:-1]), 0.0)
-    time = 2 * float(track.gaps_s @ diagonal) * len(steps)
-    total = float(
-        np.sum(diagonal * steps**2) + 2 * np.sum(off_diagonal * steps[:, 1:] * steps[:, :-1])
-    )
+    weights = bands(diagonal, np.where(track.linked, 0.5 * (diagonal[1:] + diagonal[:-1]), 0.0))
+    time = 2 * float(track.gaps_s @ diagonal) * len(track.steps_nm)
+    total = float(np.sum(track.steps_nm.T * (weights @ track.steps_nm.T)))
     variance = 0.0
     for error, band in zip(*track.error, strict=True):
-        main, next_ = error + d_nm2_s * track.rate[0], band + d_nm2_s * track.rate[1]
-        variance += 2 * _square_trace((diagonal, off_diagonal), (main, next_))
+        product = weights @ bands(error + d_nm2_s * track.rate[0], band + d_nm2_s * track.rate[1])
+        variance += 2 * float(product.multiply(product.T).sum())
     return total / time, math.sqrt(variance) / time
 
 
-def _square_trace(one: tuple[FloatArray, FloatArray], two: tuple[FloatArray, FloatArray]) -> float:
-    """Trace of (AB)² of symmetric tridiagonal matrices, each its diagonal and what is beside."""
-    (a, b), (c, d) = one, two
-    main = a * c
-    main[:-1] += b * d
-    main[1:] += b * d
-    above, below = a[:-1] * d + b * c[1:], b * c[:-1] + a[1:] * d
-    farther = b[:-1] * d[1:] * b[1:] * d[:-1]
-    return float(np.sum(main**2) + 2 * np.sum(above * below) + 2 * np.sum(farther))
+def bands(main: FloatArray, beside: FloatArray) -> scipy.sparse.csr_array:
+    """Make a symmetric matrix of its diagonal and the band beside it."""
+    return scipy.sparse.diags_array([beside, main, beside], offsets=(-1, 0, 1), format="csr")

@@ -32,7 +32,7 @@ from iscat_analysis._kernels.harmonic_trap import most_likely_well
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in, shown
 from iscat_analysis.records import FloatArray
-from iscat_analysis.species.diffusion import NM2_PER_UM2, Displacements, gather, most_likely
+from iscat_analysis.species.diffusion import NM2_PER_UM2, Displacements, bands, gather
 
 STRETCH = 40
 """Displacements at least of a stretch of a track whose D is compared with that of the others."""
@@ -146,11 +146,15 @@ def anomalous_test(
             f"frames: {track.frames.size} positions are more than the {MOST_POSITIONS} whose "
             "covariance fits into memory; give a part of the track"
         )
-    free = most_likely(track)
-    if not free > 0:
+    return exponent_of(track)
+
+
+def exponent_of(track: Displacements) -> AnomalousTest:
+    """Test whether the exponent of a track that is checked is 1."""
+    if not track.best_nm2_s > 0:
         return AnomalousTest(1.0, 0.0, math.nan, math.nan, 0.0)
-    found = most_likely_power(track, free)
-    ratio = max(2 * (found.value - track.likelihood(free).value), 0.0)
+    found = most_likely_power(track, track.best_nm2_s)
+    ratio = max(2 * (found.value - track.best.value), 0.0)
     return AnomalousTest(
         p_value=float(chdtrc(1, ratio)),
         ratio=ratio,
@@ -220,15 +224,20 @@ def confinement_test(
         number_in("enough", enough, least=1, whole=True)
     if rng is not None and not isinstance(rng, np.random.Generator):
         raise ConfigError(f"rng = {shown(rng)}: give what numpy.random.default_rng(1) returns")
-    draw = np.random.default_rng(1) if rng is None else rng
-    free = most_likely(track)
+    return well_of(track, turns, enough, np.random.default_rng(1) if rng is None else rng)
+
+
+def well_of(
+    track: Displacements, resamples: int, enough: int | None, rng: np.random.Generator
+) -> ConfinementTest:
+    """Test whether a track that is checked stays in a well."""
+    free = track.best_nm2_s
     if not free > 0:
         return ConfinementTest(1.0, 0.0, math.inf, 0.0)
-    ratio, d, stiffness = _harmonic_trap(track, free)
+    ratio, d, stiffness = _harmonic_trap(track)
     larger, p_value = 0, math.nan
-    for number in range(1, turns + 1):
-        drawn = free_track(track, free, draw)
-        larger += _harmonic_trap(drawn, most_likely(drawn))[0] >= ratio
+    for number in range(1, resamples + 1):
+        larger += _harmonic_trap(free_track(track, free, rng))[0] >= ratio
         p_value = (larger + 1) / (number + 1)
         if larger == enough:
             p_value = larger / number
@@ -237,14 +246,7 @@ def confinement_test(
     return ConfinementTest(p_value, ratio, size, d / NM2_PER_UM2)
 
 
-def steadiness_test(
-    frames: ArrayLike,
-    positions_nm: ArrayLike,
-    sigma_nm: ArrayLike,
-    *,
-    frame_rate_hz: float,
-    exposure_ms: float | None = None,
-) -> float:
+def steadiness_of(track: Displacements) -> float:
     """Test whether a track has one D from its beginning to its end.
 
     A track that was continued by another particle after they met has not.
@@ -253,42 +255,38 @@ def steadiness_test(
     -----
     Twice the difference of the logarithms is χ² with one degree of freedom fewer than there are
     stretches (S. S. Wilks, Ann. Math. Stat. 9, 60, 1938).
-
-    Shapes: `frames` (n,), `positions_nm` (n,) or (n, c).
     """
-    track = gather(
-        frames, positions_nm, sigma_nm, frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms
-    )
     last = track.frames.size - 1
     count = min(last // STRETCH, _MOST_STRETCHES)
     if count < 2:
         return 1.0
-    ends = np.linspace(0, last, count + 1).astype(int)
-    common, ratio = most_likely(track), 0.0
-    for a, b in pairwise(ends):
-        part = replace(
-            track,
-            positions_nm=track.positions_nm[:, a : b + 1],
-            variance_nm2=track.variance_nm2[:, a : b + 1],
-            frames=track.frames[a : b + 1],
-            counted=np.arange(b - a),
-        )
-        ratio += 2 * (part.likelihood(most_likely(part)).value - part.likelihood(common).value)
+    ratio = 0.0
+    for a, b in pairwise(np.linspace(0, last, count + 1).astype(int)):
+        part = stretch_of(track, slice(a, b + 1))
+        ratio += 2 * (part.best.value - part.likelihood(track.best_nm2_s).value)
     return float(chdtrc(count - 1, max(ratio, 0.0)))
 
 
-def _harmonic_trap(track: Displacements, free: float) -> tuple[float, float, float]:
-    """Find the well of highest likelihood: the ratio, D [nm²/s] and κ [1/s]."""
-    none = track.likelihood(free).value
-    scale = free or float(np.mean(track.steps_nm**2 / track.rate[0]))
-    softest = _LEAST_STIFFNESS / float(track.gaps_s.sum())
-    stiffest = _LARGEST_STIFFNESS / track.interval_s
+def stretch_of(track: Displacements, kept: slice) -> Displacements:
+    """Take some positions that follow each other; all displacements between them count."""
+    frames = track.frames[kept]
+    return replace(
+        track,
+        positions_nm=track.positions_nm[:, kept],
+        variance_nm2=track.variance_nm2[:, kept],
+        frames=frames,
+        counted=np.arange(frames.size - 1),
+    )
 
+
+def _harmonic_trap(track: Displacements) -> tuple[float, float, float]:
+    """Find the well of highest likelihood: the ratio, D [nm²/s] and κ [1/s]."""
     value, d, stiffness = most_likely_well(
         track.positions_nm, track.variance_nm2, track.gaps_s, track.exposure_s,
-        scale, softest, stiffest,
+        track.best_nm2_s or float(np.mean(track.steps_nm**2 / track.rate[0])),
+        _LEAST_STIFFNESS / float(track.gaps_s.sum()), _LARGEST_STIFFNESS / track.interval_s,
     )  # fmt: skip
-    return max(2 * (value - none), 0.0), d, stiffness
+    return max(2 * (value - track.best.value), 0.0), d, stiffness
 
 
 def free_track(track: Displacements, d: float, rng: np.random.Generator) -> Displacements:
@@ -304,7 +302,7 @@ def free_track(track: Displacements, d: float, rng: np.random.Generator) -> Disp
     mean = np.cumsum(between, axis=1) + during / 2
     mean += math.sqrt(d * e / 6) * rng.standard_normal(shape)
     mean += np.sqrt(track.variance_nm2) * rng.standard_normal(shape)
-    return track.moved(mean)
+    return replace(track, positions_nm=mean)
 
 
 _EXPONENTS = (0.02, 1.98)
@@ -312,9 +310,9 @@ _LN_D = 20.0  # from ln D of free diffusion at most
 # An exposure this small a part of a lag blurs by a series; the closed form cancels
 _SHORT_EXPOSURE = 1e-2
 _EXPONENT_STEP = 1e-3  # of an exponent, for the derivatives of the mean-squared displacement
-_LAST_STEP_SIGMAS = 0.1  # standard errors: of a step of Newton's method that is the last one
+_SETTLED = 1e-3  # twice the gain of log-likelihood that a last step expects
 _NO_STEP = 1e-6  # of ln D and α
-_MOST_STEPS = 50  # steps
+_MOST_STEPS = 50
 _MOST_ROWS_DIRECT = 80  # rows of a matrix that is not halved to be inverted
 
 
@@ -354,110 +352,77 @@ class Lags(NamedTuple):
 
 
 def most_likely_power(track: Displacements, free: float) -> Fractional:
-    """Maximise the likelihood of D and α by Newton's method."""
+    """Maximise the likelihood of D and α by Newton's method, within limits."""
     lags = Lags.of(track)
     at = np.array([math.log(free), 1.0])
     low, high = np.array([at[0] - _LN_D, _EXPONENTS[0]]), np.array([at[0] + _LN_D, _EXPONENTS[1]])
-    here = likelihood_at(track, lags, free, 1.0)
+    here = likelihood_at(track, lags, at)
     if not math.isfinite(here.value):
         return Fractional(here.value, free, 1.0, math.nan)
     for _ in range(_MOST_STEPS):
-        step, gain = _newton(here, low - at, high - at)
-        if 2 * gain < _LAST_STEP_SIGMAS**2:
+        known = here.curvature
+        if not (known[1, 1] > 0 and np.linalg.det(known) > 0):
+            known = here.information
+        alpha = np.clip(np.linalg.solve(known, here.slope)[1], low[1] - at[1], high[1] - at[1])
+        ln_d = (here.slope[0] - known[0, 1] * alpha) / known[0, 0]
+        step = np.array([np.clip(ln_d, low[0] - at[0], high[0] - at[0]), alpha])
+        if here.slope @ step < _SETTLED:
             break
-        there = likelihood_at(track, lags, *_powers(at + step))
+        there = likelihood_at(track, lags, at + step)
         while not there.value > here.value and np.abs(step).max() > _NO_STEP:
             step /= 2
-            there = likelihood_at(track, lags, *_powers(at + step))
+            there = likelihood_at(track, lags, at + step)
         if not there.value > here.value:  # rounding is all that is left
-            step, gain = np.zeros(2), 0.0
             break
         at, here = at + step, there
     sigma = math.sqrt(float(np.linalg.inv(here.information)[1, 1]))
-    return Fractional(here.value + gain, *_powers(at + step), sigma)
+    return Fractional(here.value, math.exp(at[0]), float(at[1]), sigma)
 
 
-def _powers(at: FloatArray) -> tuple[float, float]:
-    """Give D and α, from ln D and α."""
-    return math.exp(at[0]), float(at[1])
-
-
-def _newton(here: _There, least: FloatArray, most: FloatArray) -> tuple[FloatArray, float]:
-    """Newton step inside a range, and the expected gain of the likelihood."""
-    curvature = here.curvature
-    if not (curvature[1, 1] > 0 and np.linalg.det(curvature) > 0):
-        curvature = here.information
-    alpha = float(np.clip(np.linalg.solve(curvature, here.slope)[1], least[1], most[1]))
-    ln_d = (here.slope[0] - curvature[0, 1] * alpha) / curvature[0, 0]
-    step: FloatArray = np.array([float(np.clip(ln_d, least[0], most[0])), alpha])
-    return step, float(here.slope @ step - step @ curvature @ step / 2)
-
-
-def likelihood_at(track: Displacements, lags: Lags, d: float, exponent: float) -> _There:
-    """Log-likelihood of fractional Brownian motion, all axes; −∞ where rounding spoils it."""
+def likelihood_at(track: Displacements, lags: Lags, at: FloatArray) -> _There:
+    """Log-likelihood of fractional Brownian motion at (ln D, α), all axes; −∞ where it rounds."""
     before, there, after = (
-        d * mean_squared_displacement(track, lags.distinct, power)
-        for power in exponent + _EXPONENT_STEP * np.arange(-1, 2)
+        math.exp(at[0]) * mean_squared_displacement(track, lags.distinct, power)
+        for power in at[1] + _EXPONENT_STEP * np.arange(-1, 2)
     )
-    motion = covariance(lags, there)
-    turn = covariance(lags, (after - before) / (2 * _EXPONENT_STEP))
-    motion_curvature = covariance(lags, (after - 2 * there + before) / _EXPONENT_STEP**2)
-    n = len(motion)
+    motion, turn = (
+        covariance(lags, there),
+        covariance(lags, (after - before) / (2 * _EXPONENT_STEP)),
+    )
+    bend = covariance(lags, (after - 2 * there + before) / _EXPONENT_STEP**2)
     value, slope = -0.5 * track.steps_nm.size * math.log(2 * math.pi), np.zeros(2)
     curvature, information = np.zeros((2, 2)), np.zeros((2, 2))
     for main, off_diagonal, steps in zip(*track.error, track.steps_nm, strict=True):
-        sigma = motion.copy()
-        flat = sigma.reshape(n * n)
-        flat[:: n + 1] += main
-        flat[1 :: n + 1] += off_diagonal
-        flat[n :: n + 1] += off_diagonal
+        noise = bands(main, off_diagonal)
         try:
-            inverse, log_determinant = _inverse(sigma)
+            inverse, log_determinant = _inverse(motion + noise.toarray())
         except np.linalg.LinAlgError:
             return _There(-math.inf, slope, curvature, information)
-        value -= log_determinant / 2
         z = inverse @ steps
-        value -= float(steps @ z) / 2
-        by_d = -main[:, None] * inverse  # Σ_a W
-        by_d[1:] -= off_diagonal[:, None] * inverse[:-1]
-        by_d[:-1] -= off_diagonal[:, None] * inverse[1:]
-        by_d.reshape(n * n)[:: n + 1] += 1
-        by_alpha = turn @ inverse
-        force = np.array([by_d @ steps, by_alpha @ steps])  # Σ_a z
-        trace = np.array([np.trace(by_d), np.trace(by_alpha)])
-        slope += (force @ z - trace) / 2
-        fisher = np.empty((2, 2))
-        fisher[0, 0], fisher[1, 1] = (np.einsum("ij,ji", by, by) / 2 for by in (by_d, by_alpha))
-        fisher[0, 1] = fisher[1, 0] = np.einsum("ij,ji", by_d, by_alpha) / 2
-        second = np.empty((2, 2))  # z·Σ_ab z − tr WΣ_ab
-        second[0] = second[:, 0] = force @ z - trace
-        second[1, 1] = z @ motion_curvature @ z - np.einsum("ij,ij", inverse, motion_curvature)
+        value -= (log_determinant + float(steps @ z)) / 2
+        rises = np.eye(steps.size) - noise @ inverse, turn @ inverse  # Σ_a W, for ln D and for α
+        force = np.array([rise @ steps for rise in rises])
+        pull = force @ z - [np.trace(rise) for rise in rises]
+        slope += pull / 2
+        fisher = np.array([[np.einsum("ij,ji", a, b) / 2 for b in rises] for a in rises])
+        second = np.array([pull, pull])  # z·Σ_ab z − tr WΣ_ab
+        second[1] = pull[1], z @ bend @ z - np.einsum("ij,ij", inverse, bend)
         curvature += force @ inverse @ force.T - fisher - second / 2
         information += fisher
     return _There(value, slope, curvature, information)
 
 
 def _inverse(sigma: FloatArray) -> tuple[FloatArray, float]:
-    """Invert a covariance by halves, and compute the logarithm of its determinant.
-
-    This needs little but matrix products.  These release other threads, which LAPACK's inverse, as
-    SciPy calls it, does not.
-    """
-    n = len(sigma)
-    if n <= _MOST_ROWS_DIRECT:
+    """Invert a covariance by halves, twice as fast as LAPACK, with its log-determinant."""
+    half = len(sigma) // 2
+    if 2 * half <= _MOST_ROWS_DIRECT:
         factor = np.linalg.cholesky(sigma)
-        out = np.asarray(np.linalg.inv(sigma), dtype=np.float64)
-        return out, 2 * float(np.log(np.diag(factor)).sum())
-    half = n // 2
+        return np.asarray(np.linalg.inv(sigma)), 2 * float(np.log(np.diag(factor)).sum())
     first, one = _inverse(sigma[:half, :half])
     slopes = first @ sigma[:half, half:]
     last, other = _inverse(sigma[half:, half:] - sigma[half:, :half] @ slopes)
-    out = np.empty_like(sigma)
-    out[half:, half:] = last
-    np.negative(slopes @ last, out=out[:half, half:])
-    out[half:, :half] = out[:half, half:].T
-    np.subtract(first, out[:half, half:] @ slopes.T, out=out[:half, :half])
-    return out, one + other
+    side = -slopes @ last
+    return np.block([[first - side @ slopes.T, side], [side.T, last]]), one + other
 
 
 def mean_squared_displacement(

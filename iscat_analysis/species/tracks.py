@@ -59,6 +59,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from itertools import combinations, pairwise
 from typing import Any
 
@@ -86,11 +87,12 @@ from iscat_analysis.species.diffusion import (
     LEAST_POSITIONS,
     NM2_PER_UM2,
     Diffusion,
-    estimate_diffusion,
-    fit_diffusion,
+    Displacements,
+    diffusion_of,
+    gather,
     hydrodynamic_diameter,
 )
-from iscat_analysis.species.motion import anomalous_test, confinement_test, steadiness_test
+from iscat_analysis.species.motion import exponent_of, steadiness_of, stretch_of, well_of
 from iscat_analysis.threads import threads
 from iscat_analysis.units import KILODALTON_KG, NM
 
@@ -209,8 +211,6 @@ def of_known(statistic: Callable[[FloatArray], Any], values: FloatArray) -> floa
     return float(statistic(known)) if known.size else np.nan
 
 
-_Factor = tuple[FloatArray, bool]
-
 _ROUNDS = 8  # of mass and weights in turn; each has an error (p σ/m)²/n of the one before
 _MASS_TOLERANCE = 1e-9  # of the mass
 
@@ -244,24 +244,29 @@ def combine_masses(
 
     Shapes: `mass_kda` (n,), `sigma_kda, crb_kda` (n,), `correlation` (n, n).
     """
-    factor = None if correlation is None else scipy.linalg.cho_factor(correlation)
+    decorrelated: Callable[[FloatArray], FloatArray] = np.asarray
+    if correlation is not None:
+        decorrelated = partial(scipy.linalg.cho_solve, scipy.linalg.cho_factor(correlation))
+
+    def weights_at(common: float, errors: FloatArray) -> FloatArray:
+        """Weights of generalised least squares, of errors as they are at the common mass."""
+        errors = errors * np.abs(mass_kda / common) ** (power / 2)
+        return np.asarray(decorrelated(1 / errors) / errors)
+
     mass = float(np.median(mass_kda))
     for _ in range(_ROUNDS):
-        before, there = mass, _at(mass, mass_kda, power)
-        mass, variance = _least_squares(mass_kda, sigma_kda * there, factor)
+        weights, before = weights_at(mass, sigma_kda), mass
+        mass = float(weights @ mass_kda / weights.sum())
         if abs(mass - before) <= _MASS_TOLERANCE * abs(mass):
             break
-    there = _at(mass, mass_kda, power)
-    _, bound = _least_squares(mass_kda, crb_kda * there, factor)
-    off = (mass_kda - mass) / (sigma_kda * there)
-    inside = float(off @ _without_correlation(off, factor))
-    free = mass_kda.size - 1
+    off = (mass_kda - mass) / (sigma_kda * np.abs(mass_kda / mass) ** (power / 2))
+    inside, free = float(off @ decorrelated(off)), mass_kda.size - 1
     return CommonMass(
         mass_kda=mass,
-        sigma_mass_kda=float(np.sqrt(variance)),
-        crb_mass_kda=float(np.sqrt(bound)),
-        scatter=float(np.sqrt(inside / free)) if free else float("nan"),
-        p_value=float(chdtrc(free, inside)) if free else float("nan"),
+        sigma_mass_kda=float(weights.sum() ** -0.5),
+        crb_mass_kda=float(weights_at(mass, crb_kda).sum() ** -0.5),
+        scatter=math.sqrt(inside / free) if free else math.nan,
+        p_value=float(chdtrc(free, inside)) if free else math.nan,
         frames=mass_kda.size,
     )
 
@@ -279,25 +284,6 @@ def information_power(tracks: Sequence[tuple[FloatArray, FloatArray]]) -> float:
         product += float(size @ (information - information.mean()))
         square += float(size @ size)
     return product / square if square > 0 else 0.0
-
-
-def _at(common: float, own: FloatArray, power: float) -> FloatArray:
-    """Factor that scales each frame's σ from its own estimate to the common mass."""
-    return np.asarray(np.abs(own / common) ** (power / 2) if power else np.ones_like(own))
-
-
-def _least_squares(
-    values: FloatArray, sigma: FloatArray, factor: _Factor | None
-) -> tuple[float, float]:
-    """Weighted mean of correlated values, and its variance."""
-    weights = _without_correlation(1 / sigma, factor) / sigma
-    total = float(weights.sum())
-    return float(weights @ values) / total, 1 / total
-
-
-def _without_correlation(values: FloatArray, factor: _Factor | None) -> FloatArray:
-    """Solve correlation · x = values; without a factor the values are independent."""
-    return values if factor is None else np.asarray(scipy.linalg.cho_solve(factor, values))
 
 
 _DEGREE = 2
@@ -635,24 +621,24 @@ def _mass(good: TrackRows, power: float, correlation: Correlation | None) -> Com
     return combine_masses(*masses, power=power, correlation=among)
 
 
-def _diffusion(placed: TrackRows, setup: TrackSetup) -> Diffusion | None:
+def _diffusion(placed: TrackRows, setup: TrackSetup) -> tuple[Diffusion, Displacements] | None:
     """Fit D to displacements that begin so far inside that they cannot have left the field."""
     least = max(LEAST_POSITIONS, setup.min_frames)
     if setup.frame_rate_hz is None or len(placed.frame) < least:
         return None
-    room = _room(placed, setup)[:-1]
-    gaps_s = np.diff(placed.frame) / setup.frame_rate_hz
-    times: Any = {"frame_rate_hz": setup.frame_rate_hz, "exposure_ms": setup.exposure_ms}
-    inside, positions = np.ones(room.size, dtype=bool), placed.positions()
+    whole = gather(
+        *placed.positions(), frame_rate_hz=setup.frame_rate_hz, exposure_ms=setup.exposure_ms
+    )
+    room, counted = _room(placed, setup)[:-1], whole
     for _ in range(_DISPLACEMENT_PASSES):
-        counted = inside
-        d_um2_s, _ = estimate_diffusion(*positions, **times, counted=counted)
-        inside = room > _STEPS * np.sqrt(2 * d_um2_s * NM2_PER_UM2 * gaps_s)
-        if inside.sum() < least - 1:
+        reach = _STEPS * np.sqrt(2 * counted.best_nm2_s * whole.gaps_s)
+        inside = np.flatnonzero(room > reach)
+        if inside.size < least - 1:
             return None
-        if np.array_equal(inside, counted):
+        if np.array_equal(inside, counted.counted):
             break
-    return fit_diffusion(*positions, **times, counted=counted, level=COVERAGE)
+        counted = replace(whole, counted=inside)
+    return diffusion_of(counted, COVERAGE), whole
 
 
 def _room(rows: TrackRows, setup: TrackSetup) -> FloatArray:
@@ -699,7 +685,7 @@ def _motions(
         found = _diffusion(places[track], setup)
         if found is None:
             return None, {}
-        return found, _tests(places[track], setup, np.random.default_rng([seed, track]))
+        return found[0], _tests(found[1], np.random.default_rng([seed, track]))
 
     motions = {}
     longest_first = sorted(places, key=lambda track: -len(places[track].frame))
@@ -708,26 +694,25 @@ def _motions(
             motions[track] = found
             progress("tracks", len(motions), len(places))
     for track in places.keys() - motions.keys():
-        motions[track] = _diffusion(places[track], setup), {}
+        one = _diffusion(places[track], setup)
+        motions[track] = one and one[0], {}
     return motions
 
 
-def _tests(placed: TrackRows, setup: TrackSetup, rng: np.random.Generator) -> dict[str, float]:
+def _tests(whole: Displacements, rng: np.random.Generator) -> dict[str, float]:
     """Test whether the motion is free; two of the tests use the first positions of long tracks."""
-    whole = placed.positions()
-    track = tuple(part[:TESTED_POSITIONS] for part in whole)
-    times: Any = {"frame_rate_hz": setup.frame_rate_hz, "exposure_ms": setup.exposure_ms}
-    walls = confinement_test(*track, **times, resamples=_FIRST_LOOK, enough=_ENOUGH, rng=rng)
+    track = stretch_of(whole, slice(TESTED_POSITIONS))
+    walls = well_of(track, _FIRST_LOOK, _ENOUGH, rng)
     if walls.p_value <= _MOST_DOUBTFUL_SHARE:
-        walls = confinement_test(*track, **times, resamples=_FULL_LOOK, rng=rng)
-    power = anomalous_test(*track, **times)
+        walls = well_of(track, _FULL_LOOK, None, rng)
+    power = exponent_of(track)
     return {
         "p_confinement": walls.p_value,
         "confinement_nm": walls.confinement_nm if walls.p_value <= SURPRISING else np.nan,
         "exponent": power.exponent,
         "sigma_exponent": power.sigma_exponent,
         "p_anomalous": power.p_value,
-        "p_steady": steadiness_test(*whole, **times),
+        "p_steady": steadiness_of(whole),
     }
 
 

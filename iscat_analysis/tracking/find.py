@@ -62,7 +62,7 @@ from iscat_analysis.records import (
     silent,
 )
 from iscat_analysis.search.frames import DARK, well_lit
-from iscat_analysis.species.diffusion import estimate_diffusion
+from iscat_analysis.species.diffusion import gather
 from iscat_analysis.species.tracks import rows_by_track
 from iscat_analysis.threads import start_in_thread, threads
 from iscat_analysis.tracking.blocks import Block, BlockStore, analyse_block, finding_of, join_blocks
@@ -142,9 +142,8 @@ def _path_variance_nm2(config: Config, fits: pd.DataFrame) -> float:
     for rows in rows_by_track(fits).values():
         placed = rows.placed()
         if len(placed.frame) >= config.track.min_frames:
-            d, _ = estimate_diffusion(
-                *placed.positions(), frame_rate_hz=rate, exposure_ms=1e3 * exposure_s
-            )
+            track = gather(*placed.positions(), frame_rate_hz=rate, exposure_ms=1e3 * exposure_s)
+            d, _ = track.estimate()
             found += [d] * len(placed.frame)
     return path_variance_nm2(max(float(np.median(found)), 0.0), exposure_s) if found else 0.0
 

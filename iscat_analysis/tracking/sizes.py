@@ -33,11 +33,7 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.model import blurred, path_variance_nm2
 from iscat_analysis.optics.sized import LARGEST_INDEX, LEAST_CONTRAST, SizedModel
 from iscat_analysis.records import FloatArray, Status, verdict
-from iscat_analysis.species.diffusion import (
-    LEAST_POSITIONS,
-    estimate_diffusion,
-    hydrodynamic_diameter,
-)
+from iscat_analysis.species.diffusion import LEAST_POSITIONS, gather, hydrodynamic_diameter
 from iscat_analysis.species.tracks import SLOWED_BY_WALL, Correlation
 from iscat_analysis.tracking.frames import exposure_of
 from iscat_analysis.tracking.table import ALONG, path_shifts
@@ -184,9 +180,8 @@ def _diffusion(context: AnalysisContext, events: Sequence[Event]) -> tuple[float
         return 0.0, 0.0
     places = np.array([event.place[:2] for event in events])
     sigma = np.array([event.fit.sigma[:2] for event in events])
-    return estimate_diffusion(
-        frames, places, sigma, frame_rate_hz=rate, exposure_ms=1e3 * exposure_s
-    )
+    track = gather(frames, places, sigma, frame_rate_hz=rate, exposure_ms=1e3 * exposure_s)
+    return track.estimate()
 
 
 def _range_around(model: SizedModel, sizes: Sequence[CommonSize]) -> tuple[float, float]:

@@ -25,7 +25,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.optics.model import path_variance_nm2
 from iscat_analysis.records import BoolArray, FloatArray
-from iscat_analysis.species.diffusion import estimate_diffusion
+from iscat_analysis.species.diffusion import gather
 from iscat_analysis.threads import start_in_thread
 from iscat_analysis.tracking.field import BLOCK, MovingField
 from iscat_analysis.tracking.frames import (
@@ -477,7 +477,8 @@ def diffusion_of(config: Config, free: BoolArray, rows: Localizations) -> FloatA
             mine &= error < 300.0 * np.nanmedian(error[mine])
         if mine.sum() >= 4:
             places = rows.frame[mine], rows.theta[mine, :2], sigma[mine]
-            out[k] = estimate_diffusion(*places, frame_rate_hz=rate, exposure_ms=1e3 * exposure)
+            track = gather(*places, frame_rate_hz=rate, exposure_ms=1e3 * exposure)
+            out[k] = track.estimate()
     return out
 
 

@@ -381,7 +381,8 @@ def test_a_track_that_another_took_over_has_no_one_d() -> None:
         kicks = np.sqrt(2 * d / RATE_HZ / 8) * rng.standard_normal((n, 8, 2))
         mean = np.cumsum(kicks.reshape(-1, 2), axis=0).reshape(n, 8, 2).mean(axis=1)
         places = mean + 25.0 * rng.standard_normal((n, 2))
-        return motion.steadiness_test(np.arange(n), places, 25.0, frame_rate_hz=RATE_HZ)
+        track = gather(np.arange(n), places, 25.0, frame_rate_hz=RATE_HZ, exposure_ms=None)
+        return motion.steadiness_of(track)
 
     assert p_of(900, 100) < 1e-6
     assert p_of(motion.STRETCH * 2, 0) == 1.0  # one displacement fewer than two stretches
@@ -396,7 +397,7 @@ def test_slopes_of_the_likelihood_of_an_exponent(exponent: float) -> None:
     part = 1e-5 * np.eye(2)
 
     def told(at: np.ndarray) -> Any:
-        return motion.likelihood_at(track, lags, math.exp(at[0]), at[1])
+        return motion.likelihood_at(track, lags, at)
 
     def covariances(at: np.ndarray) -> np.ndarray:
         one = motion.covariance(lags, motion.mean_squared_displacement(track, lags.distinct, at[1]))
@@ -431,8 +432,8 @@ def test_the_most_likely_exponent() -> None:
     for moved in (track, replace(track, positions_nm=track.positions_nm + straight)):
 
         def lost(at: np.ndarray, moved: Displacements = moved) -> float:
-            exponent = min(max(at[1], 0.02), 1.98)
-            return -motion.likelihood_at(moved, lags, math.exp(at[0]), exponent).value
+            inside = np.clip(at, [-math.inf, 0.02], [math.inf, 1.98])
+            return -motion.likelihood_at(moved, lags, inside).value
 
         best = minimize(lost, [12.0, 1.2], method="Nelder-Mead", options={"xatol": 1e-6})
         found = motion.most_likely_power(moved, 0.5 * math.exp(best.x[0]))
@@ -488,9 +489,9 @@ GOOD: dict[str, Any] = {
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"frame_rate_hz": 0.0}, "frame_rate_hz = 0.0: give one number of frames per second"),
+        ({"frame_rate_hz": 0.0}, "frame_rate_hz = 0: give one number of frames per second"),
         ({"frame_rate_hz": math.nan}, "frame_rate_hz = nan"),
-        ({"exposure_ms": -1.0}, "exposure_ms = -1.0: give one number of at least 0"),
+        ({"exposure_ms": -1.0}, "exposure_ms = -1: give one number of at least 0"),
         ({"exposure_ms": 11.0}, "exposure_ms = 11 is longer than the 10 ms from frame to frame"),
         ({"frames": [0, 1, 2]}, "at least 4 positions"),
         ({"frames": [0, 1, 1, 4, 5]}, "whole numbers that increase"),
@@ -498,12 +499,18 @@ GOOD: dict[str, Any] = {
         ({"frames": [5, 4, 2, 1, 0]}, "whole numbers that increase"),
         ({"positions_nm": np.zeros((4, 2))}, "positions_nm: has shape (4, 2); give (5,) or"),
         ({"positions_nm": np.zeros((5, 0))}, "positions_nm: has shape (5, 0)"),
-        ({"positions_nm": [0, 1, math.nan, 3, 4]}, "positions_nm: is not finite"),
-        ({"positions_nm": [0, 1, 1e12, 3, 4]}, "positions_nm = 1e+12: give nanometres"),
+        (
+            {"positions_nm": [0, 1, math.nan, 3, 4]},
+            "positions_nm = nan: give each position in nanometres",
+        ),
+        (
+            {"positions_nm": [0, 1, 1e12, 3, 4]},
+            "positions_nm = 1e+12: give each position in nanometres",
+        ),
         ({"positions_nm": ["a"] * 5}, "positions_nm: holds"),
         ({"sigma_nm": 0.0}, "sigma_nm = 0: give the standard error"),
         ({"sigma_nm": [1.0, 2.0, 3.0]}, "sigma_nm: has shape (3,)"),
-        ({"sigma_nm": [1.0, 2.0, 3.0, math.inf, 2.0]}, "sigma_nm: is not finite"),
+        ({"sigma_nm": [1.0, 2.0, 3.0, math.inf, 2.0]}, "sigma_nm = inf"),
         ({"sigma_nm": [1.0, 2.0, 3.0, 1e6, 2.0]}, "sigma_nm: goes from 1 to 1e+06 nm; leave out"),
     ],
 )
