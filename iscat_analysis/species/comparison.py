@@ -26,7 +26,7 @@ two samples do not share is not in the test.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,7 @@ from scipy.special import chdtrc
 
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.species.choices import peaks
+from iscat_analysis.species.describe import plain_of
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.maximum import TWO_SIDED_95, Maximum
 from iscat_analysis.species.mixture import Mixture
@@ -97,16 +98,7 @@ class Comparison:
         dict
             Nested, species by row.
         """
-        return {
-            "events": self.events,
-            "events_other": self.events_other,
-            "same": asdict(self.same),
-            "same_masses": asdict(self.same_masses),
-            "same_fractions": asdict(self.same_fractions),
-            "background": self.background,
-            "background_other": self.background_other,
-            "species": self.species.to_dict("records"),
-        }
+        return plain_of(self)
 
 
 def compare(first: Events, other: Events, start: Mixture) -> Comparison:

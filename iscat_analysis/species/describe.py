@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, is_dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -136,24 +136,27 @@ class Distribution:
         dict
             Nested plain values, curves by column.
         """
-        ladder = {} if self.ladder is None else {"ladder": asdict(self.ladder)}
-        return {
-            **ladder,
-            "branch": self.branch,
-            "events": self.events,
-            "species": self.species.to_dict("records"),
-            "selection": self.selection.to_dict("records"),
-            "support": self.support,
-            "histogram": self.histogram.to_dict("list"),
-            "curves": {
-                name: [float(f"{value:.{_DIGITS}g}") for value in column]
-                for name, column in self.curves.items()
-            },
-            "bandwidth_kda": self.bandwidth_kda,
-            "draws": self.draws,
-            "seed": self.seed,
-            "notes": list(self.notes),
+        found = plain_of(self, by_column=("histogram", "curves"))
+        if self.ladder is None:
+            del found["ladder"]
+        found["curves"] = {
+            name: [float(f"{value:.{_DIGITS}g}") for value in column]
+            for name, column in found["curves"].items()
         }
+        return found
+
+
+def plain_of(result: Any, by_column: Sequence[str] = ()) -> dict[str, Any]:
+    """Give the fields of a result as plain values: tables by row or column, findings as notes."""
+    found: dict[str, Any] = {}
+    for name, value in vars(result).items():
+        if isinstance(value, pd.DataFrame):
+            found[name] = value.to_dict("list" if name in by_column else "records")
+        elif name == "findings":
+            found["notes"] = [finding.text for finding in value]
+        else:
+            found[name] = asdict(value) if is_dataclass(value) else value  # type: ignore[arg-type]
+    return found
 
 
 def describe(
@@ -188,49 +191,50 @@ def describe(
     usable = possible(mass, sigma)
     if branch != "magnitude":
         usable &= (mass > 0) == (branch == "landing")
-    findings = []
-    if branch == "magnitude" and np.count_nonzero(~usable):
+    findings: list[Finding] = []
+    if branch == "magnitude" and not usable.all():
         left_out = count(int(np.count_nonzero(~usable)), "event")
         findings.append(NO_ERROR_OR_MASS({"amount": left_out}))
     events = Events(np.abs(mass[usable]), sigma[usable], efficiency if limit_known else None)
-    if events.x.size < LEAST_EVENTS:
-        few: dict[str, Value] = {"amount": count(events.x.size, "event"), "needed": LEAST_EVENTS}
-        findings.append(TOO_FEW_EVENTS(few))
-        return _undescribed(events, branch, draws, seed, findings)
-
-    choice = choice or Searched()
-    found = choice.choose(events)
-    possible_limits = [Possible(1.0, events, found.best, found.structure)]
-    if not limit_known:
-        found, possible_limits = with_edges(events, found, choice, LEAST_SPECIES - 0.5)
-    events, best = possible_limits[0].events, possible_limits[0].mixture
-    repeats, support = bootstrap(possible_limits, found, draws=draws, least=LEAST_EVENTS, seed=seed)
-    mass_kda = peaks(events, best)
-    scale_error = scale_error or np.zeros_like
-    doubtful = ratio_of_doubt(possible_limits) > MOST_DOUBT
-    found = replace(found, best=best)
-    species = _table(
-        events, found, repeats, mass[usable] > 0, scale_error(mass_kda), window_frames, doubtful
-    )
-    ladder = _ladder(choice, found, repeats, scale_error) if isinstance(choice, Ladder) else None
-    bandwidth = bandwidth_of(events, max(best.species, 1))
-    return Distribution(
-        species=species,
-        selection=selection_of(found, events.x.size),
-        support=support,
+    result = Distribution(
+        species=pd.DataFrame(columns=list(SPECIES_COLUMNS)),
+        selection=pd.DataFrame(columns=["species", "log_likelihood", "bic", "delta_bic"]),
+        support=math.nan,
         histogram=histogram_of(events),
-        curves=curves_of(events, best, bandwidth),
-        bandwidth_kda=bandwidth,
+        curves=pd.DataFrame(columns=list(CURVE_COLUMNS)),
+        bandwidth_kda=bandwidth_of(events, 1),
         events=int(events.x.size),
         branch=branch,
         draws=draws,
         seed=seed,
-        findings=(
-            *findings,
-            *_skews(best, species),
-            *_remarks(species, doubtful),
-            *existing([_brief(species, window_frames), _doubt(ladder)]),
-        ),
+    )
+    if events.x.size < LEAST_EVENTS:
+        few: dict[str, Value] = {"amount": count(events.x.size, "event"), "needed": LEAST_EVENTS}
+        return replace(result, findings=(*findings, TOO_FEW_EVENTS(few)))
+
+    choice = choice or Searched()
+    found = choice.choose(events)
+    limits = [Possible(1.0, events, found.best, found.structure)]
+    if not limit_known:
+        found, limits = with_edges(events, found, choice, LEAST_SPECIES - 0.5)
+    events, best = limits[0].events, limits[0].mixture
+    repeats, support = bootstrap(limits, found, draws=draws, least=LEAST_EVENTS, seed=seed)
+    scale_error = scale_error or np.zeros_like
+    doubtful = ratio_of_doubt(limits) > MOST_DOUBT
+    found = replace(found, best=best)
+    species = _table(events, found, repeats, mass[usable] > 0, scale_error, window_frames, doubtful)
+    ladder = _ladder(choice, found, repeats, scale_error) if isinstance(choice, Ladder) else None
+    bandwidth = bandwidth_of(events, max(best.species, 1))
+    findings += [*_skews(best, species), *_remarks(species, doubtful)]
+    findings += existing([_brief(species, window_frames), _doubt(ladder)])
+    return replace(
+        result,
+        species=species,
+        selection=selection_of(found, events.x.size),
+        support=support,
+        curves=curves_of(events, best, bandwidth),
+        bandwidth_kda=bandwidth,
+        findings=tuple(findings),
         ladder=ladder,
     )
 
@@ -240,7 +244,7 @@ def _table(
     found: Chosen,
     repeats: Sequence[Repeat],
     lands: BoolArray,
-    scale: FloatArray,
+    scale_error: Callable[[FloatArray], FloatArray],
     window_frames: int | None,
     doubtful: BoolArray,
 ) -> pd.DataFrame:
@@ -257,52 +261,41 @@ def _table(
     undetermined[:known] |= doubtful
     some = is_species & ~undetermined
     some &= ~outlier | outlier[some].all()
-    masses = [r.mass for r in repeats]
-    mass_low, mass_high = interval_of(masses, known)
-    width_low, width_high = interval_of([r.mixture.widths() for r in repeats], k)
-    part_low, part_high = interval_of([_fractions(r.mixture.came, some) for r in repeats], k)
-    count_low, count_high = interval_of([r.count for r in repeats], k)
-    came_low, came_high = interval_of([r.corrected for r in repeats], k)
-    mass = peaks(events, best)
-    searched = events.efficiency.searched if events.efficiency else 1.0
-    nothing = np.full(k - known, math.nan)
-    table = pd.DataFrame(
-        {
-            "mass_kda": np.append(mass, nothing),
-            "mass_se": np.append(_error(masses, known), nothing),
-            "mass_low": np.append(mass_low - widening(mass - mass_low, scale), nothing),
-            "mass_high": np.append(mass_high + widening(mass_high - mass, scale), nothing),
-            "mass_systematic": np.append(scale, nothing),
-            "mean_kda": np.append(best.means()[:known], nothing),
-            "width_kda": best.widths(),
-            "width_low": width_low,
-            "width_high": width_high,
-            "fraction": _fractions(best.came, some),
-            "fraction_low": part_low,
-            "fraction_high": part_high,
-            "count": seen,
-            "count_low": count_low,
-            "count_high": count_high,
-            "landing": share[lands].sum(axis=0),
-            "leaving": share[~lands].sum(axis=0),
-            "efficiency": searched * efficiency,
-            "stay_frames": np.append(_residence(events, mass, window_frames), nothing),
-            "count_corrected": best.came * best.arrived(events) / searched,
-            "corrected_low": came_low / searched,
-            "corrected_high": came_high / searched,
-            "outlier": outlier,
-        },
-        columns=list(SPECIES_COLUMNS),
+    mass, masses = peaks(events, best), [r.mass for r in repeats]
+    scale, searched = scale_error(mass), events.efficiency.searched if events.efficiency else 1.0
+    columns = {
+        "mass_kda": mass,
+        "mass_se": _error(masses, known),
+        "mass_systematic": scale,
+        "mean_kda": best.means()[:known],
+        "width_kda": best.widths(),
+        "fraction": _fractions(best.came, some),
+        "count": seen,
+        "landing": share[lands].sum(axis=0),
+        "leaving": share[~lands].sum(axis=0),
+        "efficiency": searched * efficiency,
+        "stay_frames": _residence(events, mass, window_frames),
+        "count_corrected": best.came * best.arrived(events) / searched,
+        "outlier": outlier,
+    }
+    for name, (low, high) in {
+        "mass": widened(interval_of(masses, known), mass, scale),
+        "width": interval_of([r.mixture.widths() for r in repeats], k),
+        "fraction": interval_of([_fractions(r.mixture.came, some) for r in repeats], k),
+        "count": interval_of([r.count for r in repeats], k),
+        "corrected": interval_of([r.corrected / searched for r in repeats], k),
+    }.items():
+        columns |= {f"{name}_low": low, f"{name}_high": high}
+    table = pd.DataFrame(  # a background has no mass: what only species have is shorter
+        {name: pd.Series(columns[name]) for name in SPECIES_COLUMNS}
     )
-    unknown = ["count_corrected", "corrected_low", "corrected_high", "stay_frames"]
-    if not found.held:
-        unknown += ["mass_se", "mass_low", "mass_high"]
-    table.loc[undetermined & is_species, unknown] = math.nan
+    corrected = ["count_corrected", "corrected_low", "corrected_high"]
+    unknown = [] if found.held else ["mass_se", "mass_low", "mass_high"]
+    table.loc[undetermined & is_species, [*corrected, "stay_frames", *unknown]] = math.nan
     if best.background:
         table["background"] = ~is_species
-        unknown = ["width_kda", "width_low", "width_high", "efficiency", "count_corrected",
-                   "corrected_low", "corrected_high"]  # fmt: skip
-        table.loc[~is_species, unknown] = math.nan
+        widths = ["width_kda", "width_low", "width_high", "efficiency"]
+        table.loc[~is_species, [*corrected, *widths]] = math.nan
     if found.steps:
         table.insert(0, "n", [*found.steps, *[0] * (k - known)])
     return table
@@ -352,19 +345,12 @@ def _ladder(
     scale_error: Callable[[FloatArray], FloatArray],
 ) -> LadderFit:
     """Describe the mass of the monomer."""
-    monomer, offset = choice.values(found)
+    values = np.array(choice.values(found))
     drawn = [np.array(choice.values(found, r.mixture)) for r in repeats]
-    error, (low, high) = _error(drawn, 2), interval_of(drawn, 2)
-    scale = scale_error(np.array([monomer]))
-    below, above = (
-        float(widening(np.array([r]), scale)[0]) for r in (monomer - low[0], high[0] - monomer)
-    )
-    return LadderFit(
-        found.steps,
-        monomer, float(error[0]), float(low[0]) - below, float(high[0]) + above,
-        offset, float(error[1]), float(low[1]), float(high[1]),
-        choice.held, found.p_value,
-    )  # fmt: skip
+    scale = np.append(scale_error(values[:1]), 0.0)
+    low, high = widened(interval_of(drawn, 2), values, scale)
+    monomer, offset = np.column_stack([values, _error(drawn, 2), low, high]).tolist()
+    return LadderFit(found.steps, *monomer, *offset, choice.held, found.p_value)
 
 
 def _doubt(ladder: LadderFit | None) -> Finding | None:
@@ -383,10 +369,13 @@ def _residence(events: Events, mass: FloatArray, window_frames: int | None) -> F
     return np.where(frames <= window_frames, np.maximum(frames, 1.0), math.nan)
 
 
-def widening(reach: FloatArray, scale: FloatArray) -> FloatArray:
-    """Distance by which the error of the scale moves an end of a 95 % interval."""
-    reach = np.maximum(reach, 0.0)
-    return np.asarray(np.hypot(reach, TWO_SIDED_95 * scale) - reach)
+def widened(
+    ends: tuple[FloatArray, FloatArray], best: FloatArray, scale: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Widen 95 % intervals about estimates by the error of the scale that all share."""
+    away = [np.maximum(reach, 0.0) for reach in (best - ends[0], ends[1] - best)]
+    low, high = (np.hypot(reach, TWO_SIDED_95 * scale) - reach for reach in away)
+    return ends[0] - low, ends[1] + high
 
 
 def _skews(best: Mixture, species: pd.DataFrame) -> Iterator[Finding]:
@@ -435,26 +424,6 @@ def _brief(species: pd.DataFrame, window_frames: int | None) -> Finding | None:
     return BRIEF_VISITORS({"frames": count(window_frames, "frame"), "residence": residence})
 
 
-def _undescribed(
-    events: Events, branch: Branch, draws: int, seed: int, findings: Sequence[Finding]
-) -> Distribution:
-    """Describe events that are too few for a mixture."""
-    some = events.x.size > 0
-    return Distribution(
-        species=pd.DataFrame(columns=list(SPECIES_COLUMNS)),
-        selection=pd.DataFrame(columns=["species", "log_likelihood", "bic", "delta_bic"]),
-        support=math.nan,
-        histogram=histogram_of(events) if some else pd.DataFrame(columns=list(HISTOGRAM_COLUMNS)),
-        curves=pd.DataFrame(columns=list(CURVE_COLUMNS)),
-        bandwidth_kda=bandwidth_of(events, 1) if some else math.nan,
-        events=int(events.x.size),
-        branch=branch,
-        draws=draws,
-        seed=seed,
-        findings=tuple(findings),
-    )
-
-
 HISTOGRAM_COLUMNS = ("low_kda", "high_kda", "count", "count_low", "count_high")
 """Columns of `Distribution.histogram`."""
 
@@ -470,7 +439,7 @@ _MOST_BINS = 240
 def bandwidth_of(events: Events, species: int) -> float:
     """Apply Scott's rule to one peak no wider than the measurement error."""
     each = max(events.x.size / species, 1.0)
-    return float(1.06 * np.median(events.sigma) * each**-0.2)
+    return float(1.06 * np.median(events.sigma) * each**-0.2) if events.x.size else math.nan
 
 
 def poisson_interval(counts: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -488,7 +457,7 @@ def round_width(wanted: float) -> float:
 
 def histogram_of(events: Events) -> pd.DataFrame:
     """Count, with 95 % intervals."""
-    edges = _edges(events)
+    edges = _edges(events) if events.x.size else np.zeros(1)
     counts = np.histogram(events.x, edges)[0]
     columns = edges[:-1], edges[1:], counts, *poisson_interval(counts)
     return pd.DataFrame(dict(zip(HISTOGRAM_COLUMNS, columns, strict=True)))

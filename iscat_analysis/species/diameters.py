@@ -42,8 +42,9 @@ from iscat_analysis.species.describe import (
     histogram_of,
     interval_of,
     mean_density,
+    plain_of,
     selection_of,
-    widening,
+    widened,
 )
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.mixture import Mixture
@@ -98,17 +99,7 @@ class Sizes:
 
     def to_dict(self) -> dict[str, Any]:
         """Give what ``summary.json`` holds under ``sizes``."""
-        return {
-            "spheres": self.spheres,
-            "populations": self.populations.to_dict("records"),
-            "selection": self.selection.to_dict("records"),
-            "support": self.support,
-            "histogram": self.histogram.to_dict("list"),
-            "curve": self.curve.to_dict("list"),
-            "draws": self.draws,
-            "seed": self.seed,
-            "notes": list(self.notes),
-        }
+        return plain_of(self, by_column=("histogram", "curve"))
 
 
 def describe_sizes(
@@ -138,26 +129,19 @@ def describe_sizes(
         events = _beside(measured, power, found.best)
         found = choice.choose(events)
     best = found.best
-    repeats, support = bootstrap(
-        [Possible(1.0, events, best, found.structure)],
-        found,
-        draws=draws,
-        least=LEAST_EVENTS,
-        seed=seed,
-    )
-    middle_low, middle_high = interval_of([r.mixture.mean for r in repeats], best.mean.size)
-    width_low, width_high = interval_of(
-        [np.sqrt(r.mixture.variance) for r in repeats], best.mean.size
-    )
-    part_low, part_high = interval_of([r.mixture.weight for r in repeats], best.mean.size)
-    shared = np.full(best.mean.shape, common)
+    limits, k = [Possible(1.0, events, best, found.structure)], best.mean.size
+    repeats, support = bootstrap(limits, found, draws=draws, least=LEAST_EVENTS, seed=seed)
+    middle = interval_of([r.mixture.mean for r in repeats], k)
+    low, high = widened(middle, best.mean, np.full(k, common))
+    width_low, width_high = interval_of([np.sqrt(r.mixture.variance) for r in repeats], k)
+    part_low, part_high = interval_of([r.mixture.weight for r in repeats], k)
     seen = best.shares(events).sum(axis=0)
     populations = pd.DataFrame(
         {
-            "diameter_nm": np.exp(best.mean),
-            "diameter_low": np.exp(middle_low - widening(best.mean - middle_low, shared)),
-            "diameter_high": np.exp(middle_high + widening(middle_high - best.mean, shared)),
-            "diameter_systematic": common * np.exp(best.mean),
+            "diameter_nm": UNIT_NM * np.exp(best.mean),
+            "diameter_low": UNIT_NM * np.exp(low),
+            "diameter_high": UNIT_NM * np.exp(high),
+            "diameter_systematic": UNIT_NM * common * np.exp(best.mean),
             "geometric_sd": np.exp(np.sqrt(best.variance)),
             "geometric_sd_low": np.exp(width_low),
             "geometric_sd_high": np.exp(width_high),
@@ -168,7 +152,6 @@ def describe_sizes(
             "outlier": seen < LEAST_SPECIES - 0.5,
         }
     )
-    populations[[name for name in populations if name.startswith("diameter_")]] *= UNIT_NM
     histogram = histogram_of(Events(diameter, sigma, None)).rename(
         columns={"low_kda": "low_nm", "high_kda": "high_nm"}
     )
