@@ -210,7 +210,7 @@ def fit_equilibrium(
         complexes_high=expit(logits + reach),
         predicted=predicted,
         pull=(logits - np.log(predicted / (1 - predicted))) / errors,
-        background=series.weights(full)[:, -1],
+        background=series.background(full),
         profile_ln_kd=points[:, 0],
         profile_deviance=points[:, 1],
     )

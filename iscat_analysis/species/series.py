@@ -30,9 +30,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
-from scipy.special import log_ndtr, ndtr
+from numpy.typing import NDArray
+from scipy.special import expit, log_ndtr, ndtr
 
 from iscat_analysis._kernels.mixture import mixture_score
 from iscat_analysis.records import FloatArray
@@ -65,6 +67,7 @@ _NODES = 64
 _PEAK_REACH = 0.4  # of the lightest mass: events of a peak
 _SIGMA_PER_MAD = 1.4826
 _TINY = 1e-290
+_COMPLEX_STEP = 1e-30  # of a parameter: its square is nothing beside 1
 
 
 def _segments() -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -105,12 +108,11 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Shared:
-    """Parameters that all tables share; `Series.shared` makes it."""
+    """Peaks and detector that all tables share; `Series.shared` makes it."""
 
     mean: FloatArray
     variance: FloatArray
     tail: float
-    shape: FloatArray
     limit: tuple[float, float]
 
 
@@ -255,16 +257,51 @@ class Series:
         )
 
     def shared(self, theta: FloatArray) -> Shared:
-        """Convert parameters to masses, widths and the shape of the background."""
-        place = self.parts
-        mean = self.composition @ theta[:place] + theta[place]
-        variance = np.exp(2 * theta[place + 1 : self.tail]) - self.noise
-        logits = np.append(0.0, theta[self.tail + 1 : self.tail + self.knots.size])
-        shape = np.exp(logits - logits.max())
-        limit = (math.nan, math.nan)
+        """Convert parameters to masses, widths and the limit of detection."""
+        place, limit = self.parts, (math.nan, math.nan)
         if self.learned:
             limit = float(theta[self.shares - 2]), float(theta[self.shares - 1])
-        return Shared(mean, variance, float(theta[self.tail]), shape / shape.sum(), limit)
+        mean = self.composition @ theta[:place] + theta[place]
+        variance = np.exp(2 * theta[place + 1 : self.tail]) - self.noise
+        return Shared(mean, variance, float(theta[self.tail]), limit)
+
+    def _of_tables(self, theta: FloatArray) -> FloatArray:
+        """Parameters of each table: those of all, its share of background, its logits.
+
+        Shapes: `theta` (p,), result (tables, shares + k).
+        """
+        common = np.tile(theta[: self.shares], (self.number, 1))
+        share = theta[self.shares : self.own, None]
+        return np.hstack([common, share, theta[self.own :].reshape(self.number, self.kinds - 1)])
+
+    def _parts(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Give ln w, μ and τ² of the parts of all species and of the background.
+
+        Complex parameters give the slopes with the values (complex steps: Squire & Trapp, SIAM
+        Rev. 40, 110, 1998).
+
+        Shapes: `x` (…, shares + k), result (…, 3, parts).
+        """
+        place, front = self.parts, (*x.shape[:-1], -1)
+        mean = x[..., :place] @ self.composition.T + x[..., place, None]
+        width = np.exp(x[..., place + 1 : self.tail])
+        reach = (x[..., self.tail, None] * width)[..., None]
+        means = mean[..., None] + reach * MEANS
+        variances = (width**2)[..., None] - self.noise + reach**2 * VARIANCES
+        nothing = np.zeros_like(x[..., :1])  # the logits of the first knot and the first species
+        shape = np.exp(
+            np.concatenate([nothing, x[..., self.tail + 1 : self.tail + self.knots.size]], axis=-1)
+        )
+        back = (shape @ self.back_share.T) / shape.sum(axis=-1, keepdims=True)
+        share, logits = np.split(x[..., self.shares :], [1], axis=-1)
+        logits = np.concatenate([nothing, logits], axis=-1)
+        species = logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True))
+        beside = np.log1p(np.exp(share))
+        weights = (species - beside)[..., None] + np.log(SHARES)
+        own = np.stack([part.reshape(front) for part in (weights, means, variances)], axis=-2)
+        level = np.broadcast_to(nothing, back.shape)
+        behind = [np.log(back) + share - beside, self.back_mean + level, self.back_variance + level]
+        return np.concatenate([own, np.stack(behind, axis=-2)], axis=-1)
 
     def modes(self, theta: FloatArray) -> FloatArray:
         """Give the masses at which the peaks are highest, for the median noise of events.
@@ -273,32 +310,22 @@ class Series:
 
         Shapes: result (k,).
         """
-        now = self.shared(theta)
-        means, variances = self._parts(now)
-        return np.array(
-            [top_of(SHARES, m, v + self.noise) for m, v in zip(means, variances, strict=True)]
-        )
-
-    def _parts(self, now: Shared) -> tuple[FloatArray, FloatArray]:
-        """Means and variances of the parts of each species (k, q)."""
-        width = np.sqrt(now.variance + self.noise)[:, None]
-        return (
-            now.mean[:, None] + now.tail * width * MEANS,
-            now.variance[:, None] + (now.tail * width) ** 2 * VARIANCES,
-        )
+        size = self.kinds * SHARES.size
+        parts = self._parts(self._of_tables(theta)[0])[1:, :size].reshape(2, self.kinds, -1)
+        return np.array([top_of(SHARES, m, v + self.noise) for m, v in zip(*parts, strict=True)])
 
     def detected(self, theta: FloatArray) -> FloatArray:
         """Give the share of each species that the learned limit lets through; else 1.
 
         Shapes: result (k,).
         """
-        now = self.shared(theta)
         if not self.learned:
             return np.ones(self.kinds)
+        now = self.shared(theta)
         limit, spread = now.limit
-        reach = np.sqrt(now.variance + self.noise + spread**2)
-        width = np.sqrt(now.variance + self.noise)
-        return np.asarray(ndtr((now.mean + now.tail * width - limit) / reach))
+        total = now.variance + self.noise
+        at = (now.mean + now.tail * np.sqrt(total) - limit) / np.sqrt(total + spread**2)
+        return np.asarray(ndtr(at))
 
     def logits(self, theta: FloatArray) -> FloatArray:
         """Give the logits of the species of each table, the first 0.
@@ -308,30 +335,20 @@ class Series:
         found = theta[self.own :].reshape(self.number, self.kinds - 1)
         return np.hstack([np.zeros((self.number, 1)), found])
 
-    def weights(self, theta: FloatArray) -> FloatArray:
-        """Shares of the species and of the background, among the particles that came.
-
-        The background's logit counts from all species together.
-
-        Shapes: result (tables, k + 1).
-        """
-        logits = self.logits(theta)
-        species = np.exp(logits - np.logaddexp.reduce(logits, axis=1)[:, None])
-        odds = np.exp(theta[self.shares : self.own])[:, None]
-        return np.asarray(np.hstack([species, odds]) / (1 + odds))
+    def background(self, theta: FloatArray) -> FloatArray:
+        """Share of the background of each table among what came, (tables,)."""
+        return np.asarray(expit(theta[self.shares : self.own]))
 
     def _scores(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Log-likelihood of each table; its slopes in what tables share, its share and its logits.
 
         Shapes: `theta` (p,), results (tables,), (tables, shares + k).
         """
-        now, weights = self.shared(theta), self.weights(theta)
-        means, variances = self._parts(now)
-        k, q = means.shape
-        mean = np.append(means.ravel(), self.back_mean)
-        variance = np.append(variances.ravel(), self.back_variance)
-        back = self.back_share @ now.shape
-        weight = np.hstack([np.kron(weights[:, :-1], SHARES), weights[:, -1:] * back])
+        x = self._of_tables(theta)
+        steps = x[:, None] + 1j * _COMPLEX_STEP * np.eye(x.shape[1])
+        rises = self._parts(steps).imag / _COMPLEX_STEP
+        weight, means, variances = np.swapaxes(self._parts(x), 0, 1)
+        weight, mean, variance = np.exp(weight), means[0], variances[0]
         values = np.zeros(self.number)
         by_part = np.zeros((self.number, 3, mean.size))
         for number, table in enumerate(self.tables):
@@ -340,7 +357,7 @@ class Series:
                     table.x, table.noise, weight[number], mean, variance
                 )
         # The chance that a particle of a part is seen within the window, (tables, parts).
-        limit, spread = now.limit
+        limit, spread = self.shared(theta).limit
         seen = np.array([table.seen for table in self.tables])
         at_nodes = (self.nodes - limit) / spread
         if self.learned:
@@ -355,29 +372,8 @@ class Series:
         norm = np.maximum((chance * weight).sum(axis=1), _TINY)
         values -= size * np.log(norm)
         over = (size / norm)[:, None]
-        by_part -= weight[:, None] * np.stack(
-            [over * chance, over * seen @ rise, over * seen @ bend], axis=1
-        )
-        slopes = np.zeros((self.number, self.shares + self.kinds))
-        own, place = by_part[:, :, : k * q].reshape(self.number, 3, k, q), self.parts
-        by_mean, by_variance = own[:, 1].sum(axis=2), own[:, 2].sum(axis=2)
-        slopes[:, :place] = by_mean @ self.composition
-        slopes[:, place] = by_mean.sum(axis=1)
-        width = np.sqrt(now.variance + self.noise)
-        moved, tail = (own[:, 1] * MEANS).sum(axis=2) * width, now.tail
-        spread_out = 2 * (own[:, 2] * VARIANCES).sum(axis=2) * width**2
-        slopes[:, place + 1 : self.tail] = tail * moved + tail**2 * spread_out
-        slopes[:, place + 1 : self.tail] += 2 * width**2 * by_variance
-        slopes[:, self.tail] = moved.sum(axis=1) + tail * spread_out.sum(axis=1)
-        by_back = by_part[:, 0, k * q :]
-        by_shape = (by_back / np.maximum(back, _TINY)) @ self.back_share * now.shape
-        bends = by_shape - by_shape.sum(axis=1, keepdims=True) * now.shape
-        slopes[:, self.tail + 1 : self.tail + self.knots.size] = bends[:, 1:]
-        by_kind, share = own[:, 0].sum(axis=2), weights[:, -1]
-        species = by_kind.sum(axis=1)
-        slopes[:, self.shares] = by_back.sum(axis=1) * (1 - share) - species * share
-        part = weights[:, :-1] / (1 - share)[:, None]
-        slopes[:, self.shares + 1 :] = (by_kind - species[:, None] * part)[:, 1:]
+        by_part -= (over * weight)[:, None] * np.stack([chance, seen @ rise, seen @ bend], axis=1)
+        slopes = np.einsum("tcq,tpcq->tp", by_part, rises)
         if self.learned:
             bell = self.steps * np.exp(-0.5 * at_nodes**2) / math.sqrt(2 * math.pi)
             by_node = over * (weight @ density.T) * bell
