@@ -8,9 +8,9 @@ or a movie that grows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -22,7 +22,7 @@ from iscat_analysis.config import configure
 from iscat_analysis.day.calibrate import Day, calibrate_day
 from iscat_analysis.day.compare import Reaction, kd_name, reaction_of
 from iscat_analysis.day.gather import Found, read_movie
-from iscat_analysis.day.jobs import Outcome, Records, Runner, claim_folder, hash_of
+from iscat_analysis.day.jobs import Outcome, Runner, claim_folder, hash_of
 from iscat_analysis.day.publish import publish_day
 from iscat_analysis.day.table import (
     Movie,
@@ -87,12 +87,13 @@ class Batch:
         dict
             What ``iscat batch --json`` prints; ``iscat_analysis.schema("batch")`` describes it.
         """
+        tables = {
+            name: getattr(self, name).to_dict("records") for name in ("movies", "species", "kd")
+        }
         return {
             "out": str(self.out),
             **({"page": str(self.page)} if self.page.is_file() else {}),
-            "movies": self.movies.to_dict("records"),
-            "species": self.species.to_dict("records"),
-            "kd": self.kd.to_dict("records"),
+            **tables,
             "analysed": list(self.analysed),
             "failed": [{"name": name, "why": why} for name, why in self.failed],
         }
@@ -186,16 +187,7 @@ def batch(
         where = (options["scheduler"], options["scheduler_file"])
         with open_executor(*(() if merge else where)) as executor:
             tell(executor.warnings(plan.config.compute.memory_limit_mb), notify)
-            runner = Runner(
-                folder,
-                Records(folder),
-                merge,
-                progress,
-                notify or _silent,
-                command_text,
-                executor,
-                retry,
-            )
+            runner = Runner(folder, executor, command_text, progress, notify, merge, retry)
             day = calibrate_day(plan, runner)
             wanted = part_of(plan.movies, only)
             queue = wanted
@@ -217,24 +209,19 @@ def batch(
         raise KeyboardInterrupt(
             f"{done} of {len(plan.movies)} movies are finished; the same command goes on"
         ) from None
-    outcomes = {**{name: day.outcomes[name] for name in _flats(plan)}, **outcomes}
+    flats = [flat.name for flat in plan.flats]
+    outcomes = {**{name: day.outcomes[name] for name in flats}, **outcomes}
     failed = [(f"calibration of the {what}", why) for what, why in day.failed]
     failed += [
         (name, outcome.why or "not analysed yet")
         for name, outcome in outcomes.items()
         if outcome.state != "done"
     ]
-    flats = _flats(plan)
     ran = tuple(name for name, each in outcomes.items() if each.ran and name not in flats)
-    if only is not None:
-        rows = [(name, each.state, each.why) for name, each in outcomes.items()]
-        movies = pd.DataFrame(rows, columns=["movie", "state", "why"])
-        return Batch(folder, movies, pd.DataFrame(), pd.DataFrame(), ran, tuple(failed))
-    return _gathered(plan, day, outcomes, reaction, runner, ran, tuple(failed))
-
-
-def _silent(_: str) -> None:
-    """Drop a message."""
+    rows = [(name, each.state, each.why) for name, each in outcomes.items()]
+    movies, nothing = pd.DataFrame(rows, columns=["movie", "state", "why"]), pd.DataFrame()
+    part = Batch(folder, movies, nothing, nothing, ran, tuple(failed))
+    return part if only is not None else _gathered(part, plan, day, outcomes, reaction, runner)
 
 
 def _bytes_of(address: Path) -> int:
@@ -245,15 +232,10 @@ def _bytes_of(address: Path) -> int:
         return 0
 
 
-def _flats(plan: Plan) -> list[str]:
-    return [flat.name for flat in plan.flats]
-
-
 def _short(outcome: Outcome) -> str:
     if outcome.state != "done" or outcome.record is None:
         return f"failed: {outcome.why}"
-    events = outcome.record["events"]
-    return count(events, "event")
+    return count(outcome.record["events"], "event")
 
 
 def _result(out: Path, movie: Movie) -> Path:
@@ -273,58 +255,48 @@ def _analyse(plan: Plan, day: Day, movie: Movie, runner: Runner) -> Outcome:
 
 
 def _gathered(
+    part: Batch,
     plan: Plan,
     day: Day,
     outcomes: Mapping[str, Outcome],
     reaction: Reaction | None,
     runner: Runner,
-    ran: tuple[str, ...],
-    failed: tuple[tuple[str, str], ...],
 ) -> Batch:
     """Make tables and page of all results, unless they are up to date."""
-    out = runner.out
+    out = part.out
     by_path = {movie.row.path: movie for movie in (*plan.flats, *plan.movies)}
     ordered = [by_path[row.path] for row in plan.table.rows]
-    key = _page_key(plan, day, ordered, outcomes, reaction)
+    rows = [
+        [m.name, repr(m.row), o.state, o.why, dict(o.record or {}).get("key")]
+        for m in ordered
+        for o in (outcomes[m.name],)
+    ]
+    key = hash_of(str(plan.table.source), repr(day.failed), rows, repr(reaction))
     with runner.records.held("page", runner.notify):
-        page = out / "batch.html"
-        if ran or not page.is_file() or runner.records.read("page").get("key") != key:
+        if (
+            part.analysed
+            or not part.page.is_file()
+            or runner.records.read("page").get("key") != key
+        ):
             runner.records.drop("page")
             found: list[Found] = []
             for movie in ordered:
                 found.append(read_movie(movie, outcomes[movie.name], _result(out, movie)))
                 runner.progress("gather", len(found), len(ordered))
-            publish_day(plan, day, found, reaction, failed, out)
+            publish_day(plan, day, found, reaction, part.failed, out)
             runner.records.write("page", {"key": key})
-    text = {"movie": str, "sample": str, "condition": str, "replicate": str}
+    text = dict.fromkeys(("movie", "sample", "condition", "replicate"), str)
     movies, species = (_read(out / f"{name}.csv", text) for name in ("movies", "species"))
-    found_kd = pd.DataFrame()
-    if reaction is not None:
-        words = dict.fromkeys(("condition", "model", "masses_kda", "remarks", "why"), str)
-        found_kd = _read(out / "kd.csv", words)
-        found_kd = found_kd.fillna(dict.fromkeys(words, ""))
-        absent = found_kd[found_kd["why"] != ""]
-        failed += tuple(zip(map(kd_name, absent["condition"]), absent["why"], strict=True))
-    return Batch(out, movies, species, found_kd, ran, failed)
+    part = replace(part, movies=movies, species=species)
+    if reaction is None:
+        return part
+    words = dict.fromkeys(("condition", "model", "masses_kda", "remarks", "why"), str)
+    kd = _read(out / "kd.csv", words).fillna(dict.fromkeys(words, ""))
+    absent = kd[kd["why"] != ""]
+    without = zip(map(kd_name, absent["condition"]), absent["why"], strict=True)
+    return replace(part, kd=kd, failed=(*part.failed, *without))
 
 
 def _read(path: Path, text: Mapping[str, type[str]]) -> pd.DataFrame:
     """Read a table as it was before it was written; a sample may be called NA."""
     return from_table(pd.read_csv(path, dtype=text, keep_default_na=False, na_values=[""]))
-
-
-def _page_key(
-    plan: Plan,
-    day: Day,
-    movies: Sequence[Movie],
-    outcomes: Mapping[str, Outcome],
-    reaction: Reaction | None,
-) -> str:
-    """Hash what the page is made of."""
-    rows = [
-        [m.name, repr(m.row), o.state, o.why, dict(o.record or {}).get("key")]
-        for m in movies
-        for o in (outcomes[m.name],)
-    ]
-    made_of = [str(plan.table.source), repr(day.failed), rows, repr(reaction)]
-    return hash_of(*made_of)

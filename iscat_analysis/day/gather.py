@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -240,53 +240,26 @@ def _typed(column: pd.Series[Any]) -> pd.Series[Any]:
         return column.map(lambda v: "" if v is None or v != v else str(v))
 
 
-def write_events(found: Sequence[Found], further: pd.DataFrame, path: Path) -> int:
-    """Write the events of all movies into one file, one movie at a time."""
-    done = [k for k, each in enumerate(found) if each.summary]
-    names: dict[str, pa.DataType] = {}
-    for k in done:
-        for name_and_type in pq.read_schema(found[k].folder / "fits.parquet"):
-            names.setdefault(name_and_type.name, name_and_type.type)
-    count = 0
-    schema = None
-    writer = None
-    try:
-        for table in _tables(found, further, done, names):
-            schema = table.schema if schema is None else schema
-            writer = writer or pq.ParquetWriter(str(path), schema, compression="zstd")
-            writer.write_table(table)
-            count += table.num_rows
-        if writer is None:
-            empty = pa.schema([(name, pa.string()) for name in LABELS])
-            writer = pq.ParquetWriter(str(path), empty, compression="zstd")
-    finally:
-        if writer is not None:
-            writer.close()
-    return count
-
-
-def _tables(
-    found: Sequence[Found],
-    further: pd.DataFrame,
-    done: Sequence[int],
-    names: Mapping[str, pa.DataType],
-) -> Iterator[pa.Table]:
-    """Give the events of one movie after another, all with the same columns."""
-    own = pa.Schema.from_pandas(further, preserve_index=False)
-    for k in done:
-        events = pq.read_table(found[k].folder / "fits.parquet")
-        rows = events.num_rows
-        columns: dict[str, Any] = {}
-        for name, value in found[k].labels.items():
-            kind = pa.float64() if name == "concentration_nm" else pa.string()
-            columns[name] = pa.array([value] * rows, kind)
-        for name_and_type in own:
-            value = further[name_and_type.name].iloc[k]
-            columns[name_and_type.name] = pa.array([value] * rows, name_and_type.type)
-        for name, kind in names.items():
-            known = name in events.column_names
-            columns[name] = events[name].cast(kind) if known else pa.nulls(rows, kind)
-        yield pa.table(columns)
+def write_events(found: Sequence[Found], further: pd.DataFrame, path: Path) -> None:
+    """Write the events of all movies into one file, one movie at a time, with the same columns."""
+    fits = {k: each.folder / "fits.parquet" for k, each in enumerate(found) if each.summary}
+    schemas = [pq.read_schema(file) for file in fits.values()]
+    of_fits = {name for schema in schemas for name in schema.names}
+    text = dict.fromkeys(set(LABELS) - {"concentration_nm"}, str)
+    labels = pd.DataFrame([each.labels for each in found]).astype(text)
+    labels = labels.join(further[[name for name in further if name not in of_fits]])
+    rows = pa.Table.from_pandas(labels, preserve_index=False).replace_schema_metadata()
+    schema = pa.unify_schemas(
+        [rows.schema, *(each.remove_metadata() for each in schemas)], promote_options="permissive"
+    )
+    with pq.ParquetWriter(str(path), schema, compression="zstd") as writer:
+        for k, file in fits.items():
+            events = pq.read_table(file).replace_schema_metadata()
+            joined = rows.take([k] * len(events))
+            for name in events.column_names:
+                joined = joined.append_column(events.schema.field(name), events[name])
+            parts = [schema.empty_table(), joined]
+            writer.write_table(pa.concat_tables(parts, promote_options="permissive"))
 
 
 SMALL_P = 0.01

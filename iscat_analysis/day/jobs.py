@@ -23,6 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from filelock import FileLock, Timeout
 
+from iscat_analysis.answers.output import Notify, tell
 from iscat_analysis.config import Config, config_to_toml, with_absolute_paths
 from iscat_analysis.errors import DataError, IscatError, SchedulerError
 from iscat_analysis.executors import Executor
@@ -74,7 +75,7 @@ class Records:
                 self.drop(name)
 
     @contextmanager
-    def held(self, name: str, notify: Callable[[str], None]) -> Iterator[None]:
+    def held(self, name: str, notify: Notify | None = None) -> Iterator[None]:
         """Lock a job, so that no other run does it at the same time."""
         path = self._path(name).with_suffix(".lock")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -82,7 +83,7 @@ class Records:
         try:
             held = take(lock, _PATIENCE_S)
         except Timeout:
-            notify(f"waiting for another run, which is at {name}")
+            tell([f"waiting for another run, which is at {name}"], notify)
             held = take(lock, -1)
         try:
             yield
@@ -145,14 +146,19 @@ def sha256_of(path: Path) -> str:
         return ""
 
 
+def seen(path: Path) -> str:
+    """Hash size, time and both ends of a movie; empty where it cannot be read."""
+    try:
+        return fingerprint(files_of(path), split_address(path)[1])
+    except OSError:
+        return ""
+
+
 def saw(record: Mapping[str, Any], path: Path) -> bool:
     """Tell whether a record belongs to a movie in its present state."""
-    try:
-        if record.get("fingerprint") == _fingerprint(path):
-            return True
-    except OSError:
-        return False
-    return bool(record.get("sha256")) and record["sha256"] == sha256_of(path)
+    now, known = seen(path), record.get("sha256")
+    same = record.get("fingerprint") == now
+    return bool(now) and (same or (bool(known) and known == sha256_of(path)))
 
 
 def results_in(folder: Path) -> dict[str, str]:
@@ -183,20 +189,6 @@ def _reads(path: Path, size: int, changed_ns: int) -> str:
     return "whole"
 
 
-def seen(path: Path) -> str:
-    """Hash size, time and both ends of a movie; empty where it cannot be read."""
-    try:
-        return _fingerprint(path)
-    except OSError:
-        return ""
-
-
-def _fingerprint(address: Path) -> str:
-    return fingerprint(files_of(address), split_address(address)[1])
-
-
-Notify = Callable[[str], None]
-
 State = Literal["done", "failed", "missing"]
 
 
@@ -215,13 +207,17 @@ class Runner:
     """Runs jobs that are not finished yet."""
 
     out: Path
-    records: Records
-    dry: bool
-    progress: Progress
-    notify: Notify
-    command: str
     executor: Executor
-    retry: bool = True
+    command: str
+    progress: Progress
+    notify: Notify | None
+    dry: bool
+    retry: bool
+
+    @property
+    def records(self) -> Records:
+        """What is known of the jobs of this folder."""
+        return Records(self.out)
 
     def job(
         self,
@@ -243,7 +239,7 @@ class Runner:
                 if "damaged" not in found.values() and found == whole:
                     return Outcome("done", record=record)
                 if not self.dry:
-                    self.notify(f"{result.parent}: is damaged, and is made anew")
+                    tell([f"{result.parent}: is damaged, and is made anew"], self.notify)
             failed = current and record["state"] == "failed"
             if self.dry or (failed and not self.retry):
                 return Outcome("failed" if failed else "missing", record.get("why", ""))
@@ -263,16 +259,10 @@ class Runner:
                 why = f"unexpected {type(error).__name__}: {error}"
             state: State = "failed" if why else "done"
             hashes = kept.get("inputs", {})
-            record = {
-                **kept,
-                "key": key,
-                "state": state,
-                "why": why,
-                "results": {} if why else results_in(result.parent),
-                "inputs": {
-                    each: {**found, **hashes.get(each, {})} for each, found in before.items()
-                },
-            }
+            results = {} if why else results_in(result.parent)
+            inputs = {each: {**found, **hashes.get(each, {})} for each, found in before.items()}
+            record = {**kept, "key": key, "state": state, "why": why}
+            record |= {"results": results, "inputs": inputs}
             self.records.write(name, record)
             return Outcome(state, why, ran=True, record=record)
 
@@ -280,37 +270,32 @@ class Runner:
         """Fit a movie unless that is done."""
 
         def work() -> dict[str, Any]:
+            absolute, known = with_absolute_paths(config), (movie, seen(movie))
+            places = self.out.absolute(), folder.absolute()
             return self.executor.call(
-                analyse_movie,
-                self.out.absolute(),
-                name,
-                (movie, seen(movie)),
-                with_absolute_paths(config),
-                folder.absolute(),
-                self.command,
-                progress=self.progress,
+                analyse_movie, name, known, absolute, places, self.command, progress=self.progress
             )
 
         return self.job(name, key_of(config), {"movie": movie}, folder / "summary.json", work)
 
 
 def analyse_movie(
-    out: Path,
     name: str,
     movie: tuple[Path, str],
     config: Config,
-    folder: Path,
+    places: tuple[Path, Path],
     command: str,
     *,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Fit a movie of a batch, wherever that is."""
+    """Fit a movie of a batch, wherever that is; `places` are those of batch and result."""
+    out, folder = places
     path, known = movie
     if not (out / STATE).is_dir():
         raise not_shared(out)
     if known and seen(path) != known:
         raise not_shared(path)
-    with Records(out).held(f"{name}.work", lambda _: None), one_thread_algebra():
+    with Records(out).held(f"{name}.work"), one_thread_algebra():
         with open_stack(path) as stack:
             shape = [int(n) for n in stack.shape]
         summary = fit_stack(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -63,7 +63,7 @@ def publish_day(
         )
         write_whole(out / f"{name}.csv", text)
     with atomic_folder(out / "figures", True, known=_figure_files(out / "figures")) as folder:
-        page = _page(plan, day, found, movies, species, shifted, series, failed, folder)
+        page = _page(plan, day, found, tables, series, failed, folder)
     write_whole(out / "batch.html", page)
     own = movies[list(movies.columns[len(MOVIE_COLUMNS) :])]
     with whole_file(out / "events.parquet") as partial:
@@ -80,15 +80,14 @@ def _page(
     plan: Plan,
     day: Day,
     found: Sequence[Found],
-    movies: pd.DataFrame,
-    species: pd.DataFrame,
-    shifted: pd.DataFrame,
+    tables: Mapping[str, pd.DataFrame],
     series: Sequence[Series],
     failed: Sequence[tuple[str, str]],
     folder: Path,
 ) -> str:
     """Make the page, and the figures in a folder."""
     groups = {each.movie.name: _group(each) for each in found}
+    movies, species = tables["movies"], tables["species"]
     timed = movies["seconds_searched"].notna() | movies["frames_searched"].isna()
     per_second = bool(timed.all())
     exposure = movies["seconds_searched" if per_second else "frames_searched"].to_numpy(float)
@@ -108,7 +107,7 @@ def _page(
         curves=[_curve(each, groups[each.movie.name]) for each in found],
         movies=shown,
         species=species.assign(group=[groups[name] for name in species["movie"]]),
-        shifts=shifted,
+        shifts=tables["shifts"],
         equilibria=[
             (each.condition, each.binding.to_dict(), each.remarks)
             for each in series
@@ -135,9 +134,7 @@ def _calibrations(day: Day) -> list[tuple[str, str, str]]:
 def _group(each: Found) -> str:
     """Give the panel of a movie: its condition, or its role."""
     row = each.movie.row
-    if row.role in ("calibrant", "blank"):
-        return row.condition or row.role
-    return row.condition
+    return row.condition or (row.role if row.role in ("calibrant", "blank") else "")
 
 
 def _curve(each: Found, group: str) -> Curve:
@@ -150,9 +147,10 @@ def _curve(each: Found, group: str) -> Curve:
 
 def reference_of(found: Sequence[Found]) -> str:
     """Name the sample that the others are compared with: the first of the table."""
-    for each in found:
-        if each.movie.row.role == "sample" and (each.summary.get("distribution") or {}).get(
-            "species"
-        ):
-            return each.movie.row.sample
-    return ""
+    described = (
+        each.movie.row.sample
+        for each in found
+        if each.movie.row.role == "sample"
+        and (each.summary.get("distribution") or {}).get("species")
+    )
+    return next(described, "")

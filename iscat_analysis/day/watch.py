@@ -26,6 +26,7 @@ from typing import Any, Unpack
 import numpy as np
 import pandas as pd
 
+from iscat_analysis.answers.output import Notify, tell
 from iscat_analysis.calibration.line import mass_line
 from iscat_analysis.config import Config, configure
 from iscat_analysis.day import Batch, batch
@@ -34,6 +35,7 @@ from iscat_analysis.day.jobs import Records, claim_folder
 from iscat_analysis.day.table import TABLES, Table, read_growing, read_standards
 from iscat_analysis.errors import ConfigError, DataError, IscatError, SchedulerError
 from iscat_analysis.fitting.run import is_resumable
+from iscat_analysis.hashing import states_of
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie import Stack, files_of, find_movies, is_open_to_write, open_stack
 from iscat_analysis.options import DayOptions, takes
@@ -42,8 +44,6 @@ from iscat_analysis.reading import is_folder
 from iscat_analysis.records import Analysis, Progress, Status, silent
 from iscat_analysis.report.output import check_output
 from iscat_analysis.units import count
-
-Notify = Callable[[str], None]
 
 RESTS = 3
 """Looks without a change after which a movie is complete."""
@@ -63,20 +63,22 @@ def watch_movie(
     out: Path,
     interval_s: float = 10.0,
     progress: Progress = silent,
-    notify: Notify = lambda _: None,
+    notify: Notify | None = None,
     command: str = "",
 ) -> Analysis:
     """Analyse a movie while it is being recorded, and all of it once the file rests."""
     path = path_in("`movie`", movie)
     number_in("`interval_s`", interval_s, above=0.0)
     check_output(out, is_resumable(out))  # now, and not when the recording is over
-    seen, ours = _Growing(path, config, notify), False
-    notify(f"looks at {path} every {interval_s:g} s, until it no longer grows")
+    say, ours = _Once(notify), False
+    seen = _Growing(path, config, notify)
+    say(f"looks at {path} every {interval_s:g} s, until it no longer grows")
     while True:
         while not seen.rests():
             seen.analyse_what_is_there()
             time.sleep(interval_s)
-        notify(f"{path.name}: has not changed for {RESTS * interval_s:g} s; all of it is analysed")
+        rested = f"has not changed for {RESTS * interval_s:g} s; all of it is analysed"
+        say(f"{path.name}: {rested}", again=True)
         try:
             found = fit_stack(
                 path, config, out=out, overwrite=ours, progress=progress, notify=notify,
@@ -89,7 +91,7 @@ def watch_movie(
             if seen.rests():
                 return found
             ours = True
-        notify(f"{path.name}: was written to meanwhile, and is watched again")
+        say(f"{path.name}: was written to meanwhile, and is watched again", again=True)
 
 
 class _Once:
@@ -100,36 +102,35 @@ class _Once:
 
     def __call__(self, text: str, *, again: bool = False) -> None:
         """Say a thing, unless it was said before."""
-        if self._notify is not None and (again or text not in self._known):
+        if again or text not in self._known:
             self._known.add(text)
-            self._notify(text)
+            tell([text], self._notify)
 
 
 class _Growing:
     """A movie that grows."""
 
-    def __init__(self, path: Path, config: Config, notify: Notify) -> None:
+    def __init__(self, path: Path, config: Config, notify: Notify | None) -> None:
         self._path, self._config, self._say = path, config, _Once(notify)
-        self._state: object = None
+        self._state: State | None = None
         self._looks, self._analysed = 0, 0
 
     def rests(self) -> bool:
         """Look at the files, and tell whether they have not changed for some looks."""
-        try:
-            found = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files_of(self._path)]
-            self._looks = self._looks + 1 if found == self._state else 0
-            rests = bool(found) and self._looks >= RESTS
-            written = rests and is_open_to_write(self._path)
-        except OSError as error:
-            self._say(f"{self._path}: cannot be read ({error.strerror}); waiting for it")
+        found = _state(self._path)
+        if found is None:
+            self._say(f"{self._path}: cannot be read; waiting for it")
             return False
+        self._looks = self._looks + 1 if found == self._state else 0
         self._state = found
-        if written:
+        if self._looks < RESTS:
+            return False
+        if written := is_open_to_write(self._path):
             self._say(
                 f"{self._path.name}: rests, but a program has it open to write and is waited for; "
                 "if that program is gone, press Ctrl-C: `iscat fit` analyses what it wrote"
             )
-        return rests and not written
+        return not written
 
     def analyse_what_is_there(self) -> None:
         """Analyse the frames that are there, if they are many more than before."""
@@ -173,7 +174,7 @@ FOLDER = "batch"
 
 _PAGES = 0.1  # share of the time that pages between two movies may take
 
-State = tuple[tuple[str, int, int], ...]
+State = tuple[tuple[int, ...], ...]
 Ready = tuple[Table, tuple[State | None, ...]]
 
 
@@ -303,7 +304,7 @@ class _MovieFiles:
 class WatchedFolder:
     """A folder that is checked for new movies."""
 
-    def __init__(self, folder: Path, out: Path, notify: Notify) -> None:
+    def __init__(self, folder: Path, out: Path, notify: Notify | None) -> None:
         self._folder, self._out, self._say = folder, out, _Once(notify)
         self._files: dict[Path, _MovieFiles] = {}
         self._taken: set[Path] = set()
@@ -356,12 +357,12 @@ class WatchedFolder:
 
 
 def _state(address: Path) -> State | None:
-    """Size and time of the files of a movie; None where there are none."""
+    """Give what changes of a movie's files when they are written to; None where there are none."""
     try:
-        found = [(file, file.stat()) for file in files_of(address)]
+        found = states_of(files_of(address))
     except OSError:
         return None
-    return tuple((str(file), stat.st_size, stat.st_mtime_ns) for file, stat in found)
+    return found if found and all(found) else None
 
 
 def _opens(address: Path) -> bool:

@@ -44,13 +44,7 @@ from __future__ import annotations
 
 from iscat_analysis.species.choices import Given, Ladder, LadderFit, Number, Searched
 from iscat_analysis.species.comparison import Comparison
-from iscat_analysis.species.describe import (
-    LEAST_EVENTS,
-    LEAST_SPECIES,
-    SPECIES_COLUMNS,
-    Distribution,
-    describe,
-)
+from iscat_analysis.species.describe import LEAST_EVENTS, SPECIES_COLUMNS, Distribution, describe
 from iscat_analysis.species.diffusion import Diffusion, fit_diffusion, hydrodynamic_diameter
 from iscat_analysis.species.events import Efficiency
 from iscat_analysis.species.motion import (
@@ -60,28 +54,3 @@ from iscat_analysis.species.motion import (
     confinement_test,
 )
 from iscat_analysis.species.tracks import TrackSetup, describe_tracks, refractive_index
-
-__all__ = [
-    "LEAST_EVENTS",
-    "LEAST_SPECIES",
-    "SPECIES_COLUMNS",
-    "AnomalousTest",
-    "Comparison",
-    "ConfinementTest",
-    "Diffusion",
-    "Distribution",
-    "Efficiency",
-    "Given",
-    "Ladder",
-    "LadderFit",
-    "Number",
-    "Searched",
-    "TrackSetup",
-    "anomalous_test",
-    "confinement_test",
-    "describe",
-    "describe_tracks",
-    "fit_diffusion",
-    "hydrodynamic_diameter",
-    "refractive_index",
-]

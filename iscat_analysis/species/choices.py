@@ -27,6 +27,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Literal
 
@@ -39,6 +40,7 @@ from iscat_analysis.records import FloatArray
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.mixture import BACKGROUND, Mixture, broad
 from iscat_analysis.species.structure import (
+    Means,
     Structure,
     fit_jointly,
     free_structure,
@@ -127,7 +129,7 @@ class Begun:
     def choose(self, events: Events) -> Chosen:
         """Climb from the given masses to the nearest maximum of the likelihood."""
         masses = np.sort(np.array(self.masses_kda, dtype=np.float64))
-        best = polish(events, ascend(events, _near(events, masses))).by_mass()
+        best = polish(events, ascend(events, _start(events, masses))).by_mass()
         return Chosen((best,), best, free_structure(events, best))
 
 
@@ -143,10 +145,8 @@ class Given:
         """Fit fractions and widths."""
         masses = np.sort(np.array(self.masses_kda, dtype=np.float64))
         start = _start(events, masses, self.background)
-        structure = _rungs(
-            events, start, masses, np.zeros((masses.size, 0)), np.zeros((2, 0)),
-            widths=self.widths, unit_kda=float(masses[0]),
-        )  # fmt: skip
+        held = Means(np.zeros((masses.size, 0)), np.zeros((2, 0)), masses)
+        structure = _rungs(events, start, held, self.widths, float(masses[0]))
         best = fit_jointly(events, start, structure)
         return Chosen((best,), best, structure, held=True)
 
@@ -212,12 +212,11 @@ class Ladder:
         free = [not self.held, self.offset and (self.held or n.size > 1)]
         begin = [1.0] if self.held else _SEARCH
         starts = [_start(events, n * monomer * s, self.background) for s in begin]
-        start = max(starts, key=lambda one: height(events, one))
-        structure = _rungs(
-            events, start, monomer * n * self.held, np.stack([n, np.ones(n.size)], axis=1)[:, free],
-            monomer * np.array([[0.5, -0.5], [2.0, 0.5]])[:, free],
-            widths=self.widths, unit_kda=monomer,
-        )  # fmt: skip
+        start = max(starts, key=partial(height, events))
+        slopes = np.stack([n, np.ones(n.size)], axis=1)[:, free]
+        limits = monomer * np.array([[0.5, -0.5], [2.0, 0.5]])[:, free]
+        means = Means(slopes, limits, monomer * n * self.held)
+        structure = _rungs(events, start, means, self.widths, monomer)
         best = fit_jointly(events, start, structure)
         return Chosen((best,), best, structure, held=True, steps=tuple(steps))
 
@@ -226,12 +225,9 @@ class Ladder:
         k = len(found.steps)
         monomer = self.monomer_kda or self.values(found)[0]
         centres = found.best.mean[:k]
-        structure = _rungs(
-            events, found.best, np.zeros(k), np.eye(k),
-            np.array([centres - 0.5 * monomer, centres + 0.5 * monomer]),
-            widths=self.widths, unit_kda=monomer,
-        )  # fmt: skip
-        more = structure.limits.low.size - found.best.parameters
+        means = Means(np.eye(k), np.array([centres - 0.5 * monomer, centres + 0.5 * monomer]))
+        structure = _rungs(events, found.best, means, self.widths, monomer)
+        more = structure.low.size - found.best.parameters
         if more <= 0:
             return math.nan
         free = fit_jointly(events, found.best, structure)
@@ -243,45 +239,24 @@ Choice = Searched | Number | Begun | Given | Ladder
 
 
 def _rungs(
-    events: Events,
-    start: Mixture,
-    origin: FloatArray,
-    slopes: FloatArray,
-    ranges: FloatArray,
-    *,
-    widths: Widths,
-    unit_kda: float,
+    events: Events, start: Mixture, means: Means, widths: Widths, unit_kda: float
 ) -> Structure:
-    """Make the structure of a ladder: means that are linear in m₁ and b.
-
-    Shapes: `origin` (k,), `slopes` (k, p), `ranges` (2, p).
-    """
-    k, common = start.narrow, widths == "common"
-    of_widths = np.ones((k, 1)) if common else np.eye(k)
-    units = np.full(slopes.shape[1], float(np.median(events.sigma)))
-    mean = start.mean[:k]
+    """Make the structure of a ladder: means that are linear in m₁ and b."""
+    mean, common = start.mean[: start.narrow], widths == "common"
     widest = _MOST_RELATIVE_WIDTH * unit_kda * np.sqrt(mean / mean.min())
-    return structure_of(
-        start, events.usual_variance, origin, slopes, ranges, units, of_widths,
-        np.full(k, widest[0]) if common else widest, prior=not common,
-    )  # fmt: skip
+    noise = events.usual_variance
+    return structure_of(start, noise, means, widest, common=common, prior=not common)
 
 
-def _start(events: Events, mean: FloatArray, background: bool) -> Mixture:
-    """Start from the species near each mass, and a faint background."""
-    near = _near(events, mean)
-    return near.on_background(*broad(events), FIRST_SHARE) if background else near
-
-
-def _near(events: Events, mean: FloatArray) -> Mixture:
-    """Take the fractions of events near each mass, and the typical error as width.
+def _start(events: Events, mean: FloatArray, background: bool = False) -> Mixture:
+    """Start from the events near each mass, with the typical error as width.
 
     Shapes: `mean` (k,).
     """
     edges = (mean[:-1] + mean[1:]) / 2
     size = np.bincount(np.searchsorted(edges, events.x), minlength=mean.size) + 1.0
-    variance = np.full(mean.size, float(np.median(events.sigma)) ** 2)
-    return Mixture(size / size.sum(), mean, variance)
+    near = Mixture(size / size.sum(), mean, np.full(mean.size, events.usual_variance))
+    return near.on_background(*broad(events), FIRST_SHARE) if background else near
 
 
 _POLISHED = 2  # starts, the best after climbing
@@ -299,17 +274,13 @@ def fit_species(
 ) -> list[Mixture]:
     """Fit 1, 2, … components, on a background; stop after two numbers without a better BIC."""
     fits: list[Mixture] = []
-    most = min(max_species, max(1, events.x.size // 5))
-    for k in range(1, most + 1):
-        starts = [_spread_start(events, k)]
+    for k in range(1, min(max_species, max(1, events.x.size // 5)) + 1):
+        start = _spread_start(events, k)
         if background:
-            starts[0] = starts[0].on_background(*broad(events), FIRST_SHARE)
-        if fits:
-            starts += split_starts(events, fits[-1])
-        climbed = sorted(
-            (ascend(events, start) for start in starts), key=lambda start: height(events, start)
-        )
-        tried = [polish(events, start) for start in climbed[-_POLISHED:]]
+            start = start.on_background(*broad(events), FIRST_SHARE)
+        starts = [start, *(split_starts(events, fits[-1]) if fits else ())]
+        climbed = sorted((ascend(events, one) for one in starts), key=partial(height, events))
+        tried = [polish(events, one) for one in climbed[-_POLISHED:]]
         fits.append(max(tried, key=lambda fit: fit.log_likelihood))
         bic = [fit.bic(events.x.size) for fit in fits]
         if k >= least and len(fits) - 1 - int(np.argmin(bic)) >= 2:

@@ -39,7 +39,7 @@ from iscat_analysis.species.describe import plain_of
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.maximum import TWO_SIDED_95, Maximum
 from iscat_analysis.species.mixture import Mixture
-from iscat_analysis.species.structure import maximise_jointly, structure_of
+from iscat_analysis.species.structure import Means, maximise_jointly, structure_of
 
 LEAST_COMPARED = 20
 """Events of a species in each sample, without which its masses are not compared."""
@@ -155,6 +155,7 @@ class _Hypothesis:
         shift = self._reach(start.means()[: self.known], unit)[self.moves]
         at = np.append(start.mean[:k], np.zeros(shift.size))
         reach = np.append(reach, shift)
+        limits = np.array([at - reach, at + reach])
         self.structures = []
         for number, events in enumerate(samples):
             own = np.eye(2)[[number]]
@@ -165,11 +166,9 @@ class _Hypothesis:
                     np.eye(of.size)[:, inner],
                 ]
             )
-            structure = structure_of(
-                start, noise, np.zeros(k), np.hstack([np.eye(k), number * belongs[:k, self.moves]]),
-                np.array([at - reach, at + reach]), np.full(at.size, unit),
-                np.eye(k), 3 * (np.sqrt(start.variance[:k]) + unit), logits=logits,
-            )  # fmt: skip
+            slopes = np.hstack([np.eye(k), number * belongs[:k, self.moves]])
+            means, widest = Means(slopes, limits), 3 * (np.sqrt(start.variance[:k]) + unit)
+            structure = structure_of(start, noise, means, widest, logits=logits)
             self.structures.append((events, structure))
         self.at_mean = logits.shape[1]
 
@@ -192,7 +191,7 @@ class _Hypothesis:
 
     def against(self, full: Maximum, narrow: _Hypothesis) -> Test:
         """Test a hypothesis that this one contains, whose optimum is known."""
-        dof = full.theta.size - narrow.structures[0][1].limits.low.size
+        dof = full.theta.size - narrow.structures[0][1].low.size
         if not dof:
             return Test(0.0, 0, math.nan)
         nearly = maximise_jointly(narrow.structures, self.mixtures(full.theta))

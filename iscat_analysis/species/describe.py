@@ -350,7 +350,8 @@ def _ladder(
     scale = np.append(scale_error(values[:1]), 0.0)
     low, high = widened(interval_of(drawn, 2), values, scale)
     monomer, offset = np.column_stack([values, _error(drawn, 2), low, high]).tolist()
-    return LadderFit(found.steps, *monomer, *offset, choice.held, found.p_value)
+    numbers: list[float] = [*monomer, *offset]
+    return LadderFit(found.steps, *numbers, held=choice.held, p_value=found.p_value)
 
 
 def _doubt(ladder: LadderFit | None) -> Finding | None:

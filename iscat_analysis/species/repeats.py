@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.special import log_ndtr, ndtri_exp
@@ -228,7 +228,7 @@ def _rivals(events: Events, fit: Mixture) -> list[Mixture]:
     """Fit one species more and, where there are two or more, one less."""
     more = [ascend(events, start, _RIVAL_STEPS) for start in split_starts(events, fit)]
     return [
-        polish(events, max(starts, key=lambda start: height(events, start)))
+        polish(events, max(starts, key=partial(height, events)))
         for starts in (more, joined_starts(fit))
         if starts
     ]

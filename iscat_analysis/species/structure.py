@@ -30,6 +30,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,28 +44,35 @@ LOGIT_REACH = 12.0
 """Weights stay within a factor of e to this power of that of the first species."""
 
 
-@dataclass(frozen=True, eq=False)
-class Limits:
-    """Limits of parameters, typical steps, and the prior −|rows θ − middle|²/2.
+class Means(NamedTuple):
+    """Means that are linear in some parameters, and the limits of these.
 
-    Shapes: `low, high, scale` (p,), `rows` (r, p), `middle` (r,).
+    Shapes: `slopes` (k, p), `limits` (2, p), `origin` (k,).
     """
 
+    slopes: FloatArray
+    limits: FloatArray
+    origin: FloatArray | float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """Linear map from parameters, within limits, to the components of one sample.
+
+    The prior of the parameters is −|rows θ − middle|²/2.
+
+    Shapes: `design` (3, every, p), `origin` (3, every), `low, high, scale` (p,), `rows` (r, p),
+    `middle` (r,).
+    """
+
+    design: FloatArray
+    origin: FloatArray
+    noise: float
     low: FloatArray
     high: FloatArray
     scale: FloatArray
     rows: FloatArray
     middle: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Structure:
-    """Linear map from parameters, within limits, to the components of one sample."""
-
-    design: FloatArray
-    origin: FloatArray
-    noise: float
-    limits: Limits
     broad: int = 0
     kind: Kinds | None = None
 
@@ -114,9 +122,9 @@ def log_likelihood(
 
     Shapes: `theta` (p,), `slope` (p,).
     """
-    limits = samples[0][1].limits
-    away = limits.rows @ theta - limits.middle
-    total, slope = -0.5 * float(away @ away), -limits.rows.T @ away
+    first = samples[0][1]
+    away = first.rows @ theta - first.middle
+    total, slope = -0.5 * float(away @ away), -first.rows.T @ away
     for events, structure in samples:
         mixture = structure.mixture(theta)
         value, slopes = score(events, mixture)
@@ -147,9 +155,8 @@ def parameters(
 
 def joint_problem(samples: Sequence[tuple[Events, Structure]]) -> Problem:
     """Make the problem of maximising the likelihood of all samples."""
-    limits, events = samples[0][1].limits, sum(events.x.size for events, _ in samples)
-    height = partial(log_likelihood, samples)
-    return Problem(height, limits.low, limits.high, limits.scale, events)
+    first, size = samples[0][1], sum(events.x.size for events, _ in samples)
+    return Problem(partial(log_likelihood, samples), first.low, first.high, first.scale, size)
 
 
 def maximise_jointly(
@@ -166,59 +173,57 @@ def maximise_jointly(
 
 def free_structure(events: Events, start: Mixture) -> Structure:
     """Free weights and widths, and free means where the detector can see the components."""
-    k, top, unit = start.narrow, float(events.x.max()), math.sqrt(events.usual_variance)
+    k, top = start.narrow, float(events.x.max())
     lightest = min(_lightest(events, start), 0.9 * top)
-    ranges = np.array([np.full(k, lightest), np.full(k, 1.05 * top)])
-    return structure_of(
-        start, events.usual_variance, np.zeros(k), np.eye(k), ranges, np.full(k, unit),
-        np.eye(k), np.full(k, top), prior=not events.plain,
-    )  # fmt: skip
+    free = Means(np.eye(k), np.repeat([[lightest], [1.05 * top]], k, axis=1))
+    return structure_of(start, events.usual_variance, free, np.full(k, top), prior=not events.plain)
 
 
 def structure_of(
     start: Mixture,
     noise: float,
-    origin: FloatArray,
-    slopes: FloatArray,
-    ranges: FloatArray,
-    units: FloatArray,
-    widths: FloatArray,
+    means: Means,
     widest: FloatArray,
     *,
+    common: bool = False,
     prior: bool = True,
     logits: FloatArray | None = None,
 ) -> Structure:
-    """Make a structure of means that are linear in p, of widths linear in q.
+    """Make a structure of means that are linear in p, of a width for each or one in `common`.
 
     Weights are linear in l, or free.  The background of `start` stays as it is, but for its share;
     a prior of widths is of components near those of `start`.
 
-    Shapes: `origin, widest` (k,), `slopes` (k, p), `ranges` (2, p), `units` (p,), `widths` (k, q),
-    `logits` (every, l).
+    Shapes: `widest` (k,), `logits` (every, l).
     """
-    (k, p), q, every = slopes.shape, widths.shape[1], start.weight.size
+    (k, p), every, unit = means.slopes.shape, start.weight.size, math.sqrt(noise)
+    widths = np.ones((k, 1)) if common else np.eye(k)
+    most = widest[:1] if common else widest
     if logits is None:
         logits = np.eye(every)[:, 1 : k + int(start.broad > 0)]
         logits[k:, k - 1 :] = 1.0
-    of_mean = logits.shape[1]
+    of_mean, q = logits.shape[1], most.size
     of_width = of_mean + p
     design, fixed = np.zeros((3, every, of_width + q)), np.zeros((3, every))
     design[0, :, :of_mean] = logits
-    design[1, :k, of_mean:of_width] = slopes
+    design[1, :k, of_mean:of_width] = means.slopes
     design[2, :k, of_width:] = widths
-    fixed[1] = np.append(origin, start.mean[k:])
+    fixed[1, :k], fixed[1, k:] = means.origin, start.mean[k:]
     fixed[2, k:] = np.log(start.variance[k:] + noise) / 2
     rows, middle = width_prior(start.mean[:k]) if prior else (np.zeros((0, k)), np.zeros(0))
-    unit, reach = math.sqrt(noise), np.full(of_mean, LOGIT_REACH)
-    most = np.array([widest[column > 0].max() for column in widths.T])
-    limits = Limits(
-        np.concatenate([-reach, ranges[0], np.full(q, math.log(unit))]),
-        np.concatenate([reach, ranges[1], np.log(np.maximum(most, 2 * unit))]),
-        np.concatenate([np.ones(of_mean), units, np.full(q, _WIDTH_STEP)]),
-        np.hstack([np.zeros((middle.size, of_width)), rows @ widths]),
-        middle,
+    reach = np.full(of_mean, LOGIT_REACH)
+    return Structure(
+        design,
+        fixed,
+        noise,
+        low=np.concatenate([-reach, means.limits[0], np.full(q, math.log(unit))]),
+        high=np.concatenate([reach, means.limits[1], np.log(np.maximum(most, 2 * unit))]),
+        scale=np.concatenate([np.ones(of_mean), np.full(p, unit), np.full(q, _WIDTH_STEP)]),
+        rows=np.hstack([np.zeros((middle.size, of_width)), rows @ widths]),
+        middle=middle,
+        broad=start.broad,
+        kind=start.kind,
     )
-    return Structure(design, fixed, noise, limits, start.broad, start.kind)
 
 
 def _lightest(events: Events, start: Mixture) -> float:

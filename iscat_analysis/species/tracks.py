@@ -100,6 +100,7 @@ NO_PLACE = (Status.NOT_CONVERGED, Status.SIDELOBE, Status.TOO_CLOSE)
 """Of rows that do not say how a particle moves."""
 
 _LARGEST_ERROR_RATIO = 300.0  # times the median error: such a place says nothing
+_FRAMES_APART_NM = 1e9  # between two frames, where neighbours of each are searched for
 
 
 @dataclass(frozen=True)
@@ -187,21 +188,21 @@ def rows_by_track(fits: pd.DataFrame) -> dict[int, TrackRows]:
 def nearest_nm(groups: Mapping[int, TrackRows]) -> dict[int, float]:
     """Smallest distance of each track to any other in the same frame [nm]."""
     own = np.repeat(np.arange(len(groups)), [len(rows.frame) for rows in groups.values()])
-    frame, x, y = (
-        np.concatenate([getattr(rows, name) for rows in groups.values()] or [[]])
-        for name in ("frame", "x_nm", "y_nm")
-    )
-    order = np.argsort(frame, kind="stable")
-    own, frame, x, y = (values[order] for values in (own, frame, x, y))
-    nearest, ahead = np.full(len(own), np.inf), 1  # of each row; others of a frame come next
-    while (together := frame[ahead:] == frame[:-ahead]).any():
-        one = np.flatnonzero(together & (own[ahead:] != own[:-ahead]))
-        apart = np.hypot(x[one + ahead] - x[one], y[one + ahead] - y[one])
-        for row in (one, one + ahead):
-            nearest[row] = np.fmin(nearest[row], apart)
-        ahead += 1
+    place = np.concatenate(
+        [
+            np.stack([rows.frame * _FRAMES_APART_NM, rows.x_nm, rows.y_nm])
+            for rows in groups.values()
+        ]
+        or [np.zeros((3, 0))],
+        axis=1,
+    ).T
+    known = np.isfinite(place).all(axis=1)
+    own, place = own[known], place[known]
+    apart, other = scipy.spatial.cKDTree(place).query(place, k=3)  # itself, and two others
+    of_track = np.append(own, -1)[other] == own[:, None]
+    apart[of_track | (apart >= _FRAMES_APART_NM)] = np.inf
     closest = np.full(len(groups), np.inf)
-    np.fmin.at(closest, own, nearest)
+    np.fmin.at(closest, own, apart.min(axis=1))
     return dict(zip(groups, closest.tolist(), strict=True))
 
 
@@ -498,31 +499,23 @@ def describe_tracks(
     )
     nearest = nearest_nm(groups)
     exact = {} if masses is None else masses.to_dict("index")
-    common = {
-        track: _mass(good, power, correlation) for track, good in massive.items() if len(good.frame)
-    }
-    wider = {
-        track: common[track].enlargement if rows.rejected and track in common else 1.0
-        for track, rows in groups.items()
-    }
-    places = {
-        track: rows.placed().timed(setup.ticks).enlarged(wider[track])
-        for track, rows in groups.items()
-    }
-    motions = _motions(places, setup, seed, workers, progress)
-    records = []
+    found = []
     for track, rows in groups.items():
-        motion, tests = motions[track]
-        record = _record(
-            track, rows, common.get(track), places[track], motion, setup, exact.get(track, {}),
-            wider[track],
-        )  # fmt: skip
-        record |= {"nearest_nm": nearest.get(track, np.inf), **tests}
-        records.append(record)
+        good = massive[track]
+        mass = _mass(good, power, correlation) if len(good.frame) else None
+        wider = mass.enlargement if rows.rejected and mass is not None else 1.0
+        placed = rows.placed().timed(setup.ticks).enlarged(wider)
+        found.append(_Track(track, rows, placed, mass, wider, exact.get(track, {})))
+    motions = _motions(found, setup, seed, workers, progress)
+    records = []
+    for each in found:
+        motion, tests = motions[each.number]
+        record = each.record(motion, setup) | {"nearest_nm": nearest[each.number], **tests}
         status = _remarks(record, setup)
         record["status"] = str(status[0]) if status else str(TrackStatus.OK)
         crossed = ["crosses"] if record["nearest_nm"] < setup.near_nm else []
         record["flags"] = ";".join([*map(str, status), *crossed])
+        records.append(record)
     return _table(records, fits)
 
 
@@ -532,65 +525,66 @@ def changes_together(fits: pd.DataFrame, frames: tuple[int, int]) -> float:
     return common_change([(g.frame, g.mass_kda, g.sigma_mass_kda) for g in massive], frames)
 
 
-def _record(
-    track: int,
-    rows: TrackRows,
-    mass: CommonMass | None,
-    placed: TrackRows,
-    found: Diffusion | None,
-    setup: TrackSetup,
-    exact: Mapping[str, float],
-    wider: float,
-) -> dict[str, Any]:
-    """Make the row of one track, without the tests of its motion.
+@dataclass(frozen=True)
+class _Track:
+    """One track: its rows, those that say where it is, its mass, and that of all frames together.
 
-    The errors of the mass are multiplied by `wider`; those of the places are already.
+    The errors of the mass are to be multiplied by `wider`; those of the places are already.
     """
-    record: dict[str, Any] = dict.fromkeys(TRACK_COLUMNS, np.nan)
-    record |= {
-        "track": track,
-        "first_frame": int(rows.frame[0]),
-        "last_frame": int(rows.frame[-1]),
-        "n_frames": len(rows.frame),
-        "n_mass_frames": 0 if mass is None else mass.frames,
-        "rejected": rows.rejected,
-        "n_d_frames": len(placed.frame),
-        "x_nm": of_known(np.mean, rows.x_nm),
-        "y_nm": of_known(np.mean, rows.y_nm),
-        "z_nm": of_known(np.mean, rows.z_nm),
-    }
-    if mass is not None:
+
+    number: int
+    rows: TrackRows
+    placed: TrackRows
+    mass: CommonMass | None
+    wider: float
+    exact: Mapping[str, float]
+
+    def record(self, found: Diffusion | None, setup: TrackSetup) -> dict[str, Any]:
+        """Make the row of the track, without the tests of its motion."""
+        rows = self.rows
+        record: dict[str, Any] = dict.fromkeys(TRACK_COLUMNS, np.nan)
         record |= {
-            "mass_kda": mass.mass_kda,
-            "sigma_mass_kda": mass.sigma_mass_kda,
-            "crb_mass_kda": mass.crb_mass_kda,
-            "mass_scatter": mass.scatter,
-            "p_mass": mass.p_value,
+            "track": self.number,
+            "first_frame": int(rows.frame[0]),
+            "last_frame": int(rows.frame[-1]),
+            "n_frames": len(rows.frame),
+            "n_mass_frames": 0,
+            "rejected": rows.rejected,
+            "n_d_frames": len(self.placed.frame),
+            **{axis: of_known(np.mean, getattr(rows, axis)) for axis in ("x_nm", "y_nm", "z_nm")},
         }
-    known_share = exact.get("told", 1.0)
-    record |= {
-        name: value for name, value in exact.items() if name != "told" and np.isfinite(value)
-    }
-    record |= {name: wider * record[name] for name in record if name in _OF_IMAGES}
-    scale = _scale_error(record, known_share)
-    record["short_way"] = known_share < _LEAST_KNOWN_SHARE and scale > 2 * _LARGEST_SCALE_ERROR
-    massive = rows.only(rows.mass_kda != 0)  # a fit may end at nothing, and so is its contrast
-    each = of_known(np.median, massive.contrast / massive.mass_kda)
-    record["contrast"] = record["mass_kda"] * each
-    if setup.frame_rate_hz is not None:
-        record["n_d_frames"] = 0 if found is None else found.n_positions
-    if found is not None:
-        record |= {
-            "d_um2_s": found.d_um2_s,
-            "sigma_d_um2_s": math.hypot(found.sigma_d_um2_s, scale * found.d_um2_s),
-            "crb_d_um2_s": found.crb_d_um2_s,
-            "d_low_um2_s": _wider(found, 0, scale),
-            "d_high_um2_s": _wider(found, 1, scale),
-            "d_disagreement": found.disagreement,
-        }
-        if setup.volume and found.interval_um2_s[0] > 0:
-            record |= _size(record, setup)
-    return record | _ends(rows, setup, record["d_um2_s"])
+        if self.mass is not None:
+            record |= {
+                "n_mass_frames": self.mass.frames,
+                "mass_kda": self.mass.mass_kda,
+                "sigma_mass_kda": self.mass.sigma_mass_kda,
+                "crb_mass_kda": self.mass.crb_mass_kda,
+                "mass_scatter": self.mass.scatter,
+                "p_mass": self.mass.p_value,
+            }
+        known = {name: value for name, value in self.exact.items() if np.isfinite(value)}
+        known_share = known.pop("told", 1.0)
+        record |= known
+        record |= {name: self.wider * record[name] for name in record if name in _OF_IMAGES}
+        scale = _scale_error(record, known_share)
+        record["short_way"] = known_share < _LEAST_KNOWN_SHARE and scale > 2 * _LARGEST_SCALE_ERROR
+        massive = rows.only(rows.mass_kda != 0)  # a fit may end at nothing, and so is its contrast
+        each = of_known(np.median, massive.contrast / massive.mass_kda)
+        record["contrast"] = record["mass_kda"] * each
+        if setup.frame_rate_hz is not None:
+            record["n_d_frames"] = 0 if found is None else found.n_positions
+        if found is not None:
+            record |= {
+                "d_um2_s": found.d_um2_s,
+                "sigma_d_um2_s": math.hypot(found.sigma_d_um2_s, scale * found.d_um2_s),
+                "crb_d_um2_s": found.crb_d_um2_s,
+                "d_low_um2_s": _wider(found, 0, scale),
+                "d_high_um2_s": _wider(found, 1, scale),
+                "d_disagreement": found.disagreement,
+            }
+            if setup.volume and found.interval_um2_s[0] > 0:
+                record |= _size(record, setup)
+        return record | _ends(rows, setup, record["d_um2_s"])
 
 
 def _scale_error(record: Mapping[str, Any], known_share: float) -> float:
@@ -677,26 +671,25 @@ def _size(record: Mapping[str, Any], setup: TrackSetup) -> dict[str, float]:
 
 
 def _motions(
-    places: Mapping[int, TrackRows], setup: TrackSetup, seed: int, workers: int, progress: Progress
+    tracks: Sequence[_Track], setup: TrackSetup, seed: int, workers: int, progress: Progress
 ) -> dict[int, tuple[Diffusion | None, dict[str, float]]]:
     """D of all tracks and the tests of their motion; an interrupt leaves tests out."""
 
-    def motion(track: int) -> tuple[Diffusion | None, dict[str, float]]:
-        found = _diffusion(places[track], setup)
+    def motion(track: _Track, tested: bool = True) -> tuple[Diffusion | None, dict[str, float]]:
+        found = _diffusion(track.placed, setup)
         if found is None:
             return None, {}
-        return found[0], _tests(found[1], np.random.default_rng([seed, track]))
+        rng = np.random.default_rng([seed, track.number])
+        return found[0], _tests(found[1], rng) if tested else {}
 
     motions = {}
-    longest_first = sorted(places, key=lambda track: -len(places[track].frame))
+    longest_first = sorted(tracks, key=lambda track: -len(track.placed.frame))
     with threads(workers) as pool, suppress(KeyboardInterrupt):
         for track, found in zip(longest_first, pool.map(motion, longest_first), strict=True):
-            motions[track] = found
-            progress("tracks", len(motions), len(places))
-    for track in places.keys() - motions.keys():
-        one = _diffusion(places[track], setup)
-        motions[track] = one and one[0], {}
-    return motions
+            motions[track.number] = found
+            progress("tracks", len(motions), len(tracks))
+    left = [track for track in tracks if track.number not in motions]
+    return motions | {track.number: motion(track, tested=False) for track in left}
 
 
 def _tests(whole: Displacements, rng: np.random.Generator) -> dict[str, float]:

@@ -86,41 +86,6 @@ class Source:
     """Whether it can make anything wrong; else it is named in the budget alone."""
 
 
-def sources_of(
-    config: Config, mass_share: float = 0.0, scale: MassScale | None = None
-) -> tuple[Source, ...]:
-    """Name the sources of errors that the events of a movie share."""
-    line = config.calibration
-    left_over = partial(_of_what_is_left_over, mass_share)
-    sources = (
-        Source("line of the standards", "measured", _of_the_line,
-               "more standards, and more events of each",
-               None if line is None or line.dof is None else float(line.dof)),
-        Source("optics of the movie", "learned", _of_the_optics,
-               "more or brighter particles, from which the optics are learned"),
-        Source("optics of the standards", "learned", _of_the_standards,
-               "more or brighter standards, or standards and sample at one focus"),
-        Source("measured picture", "measured", _of_the_template,
-               "more particles for the picture, or standards measured with it"),
-        Source("optics that do not describe the pictures", "measured", left_over,
-               "find what the model lacks: focus, aperture, aberrations, pixel size"),
-        Source("amplitude of the reference over the field", "measured", _of_the_reference,
-               "configure it: optics.reference_tilt and optics.reference_curvature"),
-        *(Source(each.label, "assumed", partial(assumed_error, each.key), each.remedy)
-          for each in INPUTS),
-    )  # fmt: skip
-    if scale is None:
-        return sources
-    return (
-        *sources,
-        Source("standards measured with unknown optics", "assumed",
-               partial(_of_the_missing_record, scale),
-               "calibrate with the folder of the standards' analysis"),
-        Source("square of the scattered light", "measured", partial(_of_heavy_particles, scale),
-               "standards as heavy as the particles"),
-    )  # fmt: skip
-
-
 Contribution = tuple[Source, Mapping[str, FloatArray]]
 """A source with what it makes of every event, by name in `COMMON`."""
 
@@ -142,7 +107,36 @@ def contributions(
     Shapes: `held_kda` (rows,) each: what heights or extensions that were held do to the masses.
     """
     camera, optics = (summary.get(name) or {} for name in ("camera", "optics"))
-    sources = [*sources_of(config, mass_share, scale), *_of_the_camera(config, camera)]
+    line = config.calibration
+    dof = None if line is None or line.dof is None else float(line.dof)
+    sources = [
+        Source("line of the standards", "measured", _of_the_line,
+               "more standards, and more events of each", dof),
+        Source("optics of the movie", "learned", _of_the_optics,
+               "more or brighter particles, from which the optics are learned"),
+        Source("optics of the standards", "learned", _of_the_standards,
+               "more or brighter standards, or standards and sample at one focus"),
+        Source("measured picture", "measured", _of_the_template,
+               "more particles for the picture, or standards measured with it"),
+        Source("optics that do not describe the pictures", "measured",
+               partial(_of_what_is_left_over, mass_share),
+               "find what the model lacks: focus, aperture, aberrations, pixel size"),
+        Source("amplitude of the reference over the field", "measured", _of_the_reference,
+               "configure it: optics.reference_tilt and optics.reference_curvature"),
+        *(Source(label, "assumed", partial(assumed_error, key), remedy)
+          for key, (label, remedy) in INPUTS.items()),
+        *_of_the_camera(config, camera),
+        *(Source(f"{name} of the particles", "measured", partial(_as_given, shift), _HELD[name])
+          for name, shift in held_kda.items() if shift.any()),
+    ]  # fmt: skip
+    if scale is not None:
+        sources += [
+            Source("standards measured with unknown optics", "assumed",
+                   partial(_of_the_missing_record, scale),
+                   "calibrate with the folder of the standards' analysis"),
+            Source("square of the scattered light", "measured", partial(_of_heavy_particles, scale),
+                   "standards as heavy as the particles"),
+        ]  # fmt: skip
     if threshold_snr:
         sources.append(
             Source("selection near the threshold", "measured",
@@ -154,7 +148,6 @@ def contributions(
             Source("optics as configured", "assumed", partial(_of_configured_optics, optics),
                    "more or brighter particles, on which the optics are tested and learned")
         )  # fmt: skip
-    sources += [_of_held(name, shift) for name, shift in held_kda.items() if shift.any()]
     found = [(source, source.errors(config, table)) for source in sources]
     return [(source, errors) for source, errors in found if errors]
 
@@ -174,15 +167,34 @@ def total(found: Sequence[Contribution], rows: int) -> dict[str, FloatArray]:
     return {name: np.where(sigma > _NOTHING[name], sigma, 0.0) for name, sigma in sums.items()}
 
 
-def _of_held(name: str, shift_kda: FloatArray) -> Source:
-    """Make a source of heights or extensions that were held although particles differ in them."""
-    remedy = {
-        "heights": 'fit them: particle.height_nm = "auto", or particle.height_sd_nm',
-        "extension": "more or brighter particles; particle.wiggle_nm, uncertainty.wiggle_nm",
-    }[name]
-    return Source(
-        f"{name} of the particles", "measured", lambda *_: {"mass_kda": shift_kda}, remedy
-    )
+_HELD = {
+    "heights": 'fit them: particle.height_nm = "auto", or particle.height_sd_nm',
+    "extension": "more or brighter particles; particle.wiggle_nm, uncertainty.wiggle_nm",
+}
+"""What shrinks the errors by heights or extensions that were held, although particles differ."""
+
+
+def _as_given(
+    shift_kda: FloatArray, config: Config, table: pd.DataFrame
+) -> Mapping[str, FloatArray]:
+    """Give errors of masses that are known already.
+
+    Shapes: `shift_kda` (rows,).
+    """
+    del config, table
+    return {"mass_kda": shift_kda}
+
+
+def _masses(table: pd.DataFrame) -> FloatArray:
+    """Magnitudes of the masses [kDa], shape (rows,)."""
+    return np.abs(table["mass_kda"].to_numpy(float))
+
+
+def _predicts_pictures(config: Config) -> bool:
+    """Whether an exact model makes pictures that interfere, of pixels of known size."""
+    optics = config.optics
+    exact = optics.convention == "exact" and optics.psf == "model"
+    return exact and optics.scheme != "darkfield" and config.camera.pixel_size_nm is not None
 
 
 _FROM_LIGHT = ("measured", "assumed")
@@ -220,8 +232,7 @@ def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Mapping[st
     Masses of dipoles are wrong by that share too.  The contrast of a sphere is not in proportion to
     its mass, and its picture changes with it.
     """
-    sizes = table[["mass_kda", "contrast"]].abs()
-    mass, contrast = (sizes[name].to_numpy(float) for name in sizes)
+    mass, contrast = _masses(table), table["contrast"].abs().to_numpy(float)
     result = {"contrast": share * contrast} if config.calibration is None else {}
     if not config.fits_sizes or not share:
         return {"mass_kda": share * mass, **result}
@@ -229,12 +240,9 @@ def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Mapping[st
     if not known.any():
         return {}
     respond = response_of(config, table, ())
-    places = table.loc[known, ["z_nm", "mass_kda"]].to_numpy(float).tolist()
+    rows = zip(table["z_nm"][known], mass[known], has_own_index(table)[known], strict=True)
     out = np.full(mass.size, np.nan)
-    out[known] = [
-        abs(share * respond.to_contrast(z, kda, index=own)) * kda
-        for (z, kda), own in zip(places, has_own_index(table)[known].tolist(), strict=True)
-    ]
+    out[known] = [abs(share * respond.to_contrast(z, kda, index=own)) * kda for z, kda, own in rows]
     return {"mass_kda": out, **result}
 
 
@@ -262,7 +270,7 @@ def _of_the_missing_record(
     line, share = config.calibration, abs(scale.carried - 1)
     if line is None or not line.optics_assumed or share < _SAME or not _fits_masses(config):
         return {}
-    return {"mass_kda": share * np.abs(table["mass_kda"].to_numpy(float))}
+    return {"mass_kda": share * _masses(table)}
 
 
 def _fits_masses(config: Config) -> bool:
@@ -322,7 +330,7 @@ def is_bent(scale: MassScale, table: pd.DataFrame) -> NDArray[np.bool_]:
     Shapes: result (rows,).
     """
     off, sigma = _off_the_line(scale, table)
-    share = off / np.maximum(np.abs(table["mass_kda"].to_numpy(float)), 1e-300)
+    share = off / np.maximum(_masses(table), 1e-300)
     return np.asarray(
         # beyond which the square is clear in a single row, however small its share
         (off > 5.0 * sigma)
@@ -362,9 +370,7 @@ def _of_the_line(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray
 def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
     """Give what the measured optics may be wrong by: D Σ Dᵀ of `bounds.shared`."""
     errors, pixel = config.optics.covariance, config.camera.pixel_size_nm
-    suited = config.optics.scheme != "darkfield" and config.optics.convention == "exact"
-    suited = suited and config.optics.psf == "model"
-    if errors is None or not errors.names or pixel is None or not suited:
+    if errors is None or not errors.names or pixel is None or not _predicts_pictures(config):
         return {}
     grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
     known = table[["z_nm", "mass_kda"]].notna().all(axis=1).to_numpy()
@@ -375,10 +381,7 @@ def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArr
     covariance = np.array(errors.matrix)
     variance = np.einsum("eik,kl,eil->ei", shifts, covariance, shifts)
     sigma = np.sqrt(np.maximum(variance, 0.0))
-    reported = [
-        *FREE_PARAMETERS[config.fit.mode],
-        *(["contrast"] if _is_about_contrast(config) else []),
-    ]
+    reported = [*FREE_PARAMETERS[config.fit.mode], *["contrast"] * _is_about_contrast(config)]
     return {name: sigma[:, k] for k, name in enumerate(COMMON) if name in reported}
 
 
@@ -394,7 +397,7 @@ def _of_configured_optics(
 
 def _is_about_contrast(config: Config) -> bool:
     """Whether contrasts are the result: masses are fitted, and no calibration makes them."""
-    return "mass_kda" in FREE_PARAMETERS[config.fit.mode] and config.calibration is None
+    return _fits_masses(config) and config.calibration is None
 
 
 def _shifts(config: Config, model: ForwardModel, table: pd.DataFrame) -> FloatArray:
@@ -462,14 +465,12 @@ def _of_the_standards(config: Config, table: pd.DataFrame) -> Mapping[str, Float
     line, pixel = config.calibration, config.camera.pixel_size_nm
     if line is None or line.optics is None or line.covariance is None or pixel is None:
         return {}
-    if line.optics.psf == "measured" or standards_share(config):
-        return {}
-    if not _fits_masses(config):
+    if line.optics.psf == "measured" or standards_share(config) or not _fits_masses(config):
         return {}
     middle = line.covariance.of_the_middle
     relative = response_of(at_standards(config), table, middle.names).faint()
     variance = float(relative @ np.array(middle.matrix) @ relative)
-    return {"mass_kda": np.abs(table["mass_kda"].to_numpy(float)) * math.sqrt(max(variance, 0.0))}
+    return {"mass_kda": _masses(table) * math.sqrt(max(variance, 0.0))}
 
 
 def _of_the_template(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
@@ -481,33 +482,23 @@ def _of_the_template(config: Config, table: pd.DataFrame) -> Mapping[str, FloatA
     optics = config.optics
     if optics.psf != "measured" or optics.template is None or config.calibration is not None:
         return {}
-    mass = table["mass_kda"].to_numpy(dtype=float)
-    contrast = table["contrast"].to_numpy(dtype=float)
-    relative = Template.read(Path(optics.template)).peak_se
-    return {"mass_kda": np.abs(mass) * relative, "contrast": np.abs(contrast) * relative}
+    relative, results = Template.read(Path(optics.template)).peak_se, ("mass_kda", "contrast")
+    return {name: relative * table[name].abs().to_numpy(float) for name in results}
 
 
 _STEP = 0.1  # of a standard deviation, for derivatives
 
 
-@dataclass(frozen=True)
-class Input:
-    """An input of the model, by its key in [uncertainty]."""
-
-    key: str
-    label: str
-    remedy: str
-
-
-INPUTS = (
-    Input("wavelength_nm", "wavelength", "measure the spectrum of the light"),
-    Input("n_sample", "refractive index of the sample", "measure the index of the buffer"),
-    Input("n_glass", "refractive index of the glass", "take the maker's value at this wavelength"),
-    Input("index", "refractive index of the spheres", "spheres that move, or of known diameter"),
-    Input("height_nm", "mean height of the particles", "standards that bind at the same height"),
-    Input("magnification", "magnification", "measure the pixel size with a graticule"),
-)
-"""In the order of the budget.  Standards of the same set-up take all of them away."""
+INPUTS = {
+    "wavelength_nm": ("wavelength", "measure the spectrum of the light"),
+    "n_sample": ("refractive index of the sample", "measure the index of the buffer"),
+    "n_glass": ("refractive index of the glass", "take the maker's value at this wavelength"),
+    "index": ("refractive index of the spheres", "spheres that move, or of known diameter"),
+    "height_nm": ("mean height of the particles", "standards that bind at the same height"),
+    "magnification": ("magnification", "measure the pixel size with a graticule"),
+}
+"""Inputs of the model by their keys in [uncertainty], in the order of the budget: what each is, and
+what shrinks its error.  Standards of the same set-up take all of them away."""
 
 
 def assumed_error(key: str, config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
@@ -530,21 +521,21 @@ def assumed_error(key: str, config: Config, table: pd.DataFrame) -> Mapping[str,
     shift is part of D, and of L where the gradient is taken at learned optics.
     """
     sigma = float(getattr(config.uncertainty, key))
-    line, optics = config.calibration, config.optics
-    if config.fits_sizes and sigma and not table.empty:
+    line = config.calibration
+    if not sigma or table.empty:
+        return {}
+    if config.fits_sizes:
         return _of_spheres(key, config, table, sigma)
-    suited = optics.scheme != "darkfield" and optics.convention == "exact"
-    suited = suited and optics.psf == "model" and config.camera.pixel_size_nm is not None
-    fitted = "mass_kda" in FREE_PARAMETERS[config.fit.mode]
-    if not sigma or key == "index" or line is None or not (suited and fitted) or table.empty:
+    suited = _predicts_pictures(config) and _fits_masses(config)
+    if key == "index" or line is None or not suited:
         return {}
     there = at_standards(config)
     recorded = line.optics is not None and not line.optics_assumed
     if recorded and _alike(config, there):
         return {}
-    mass = table["mass_kda"].to_numpy(float)
+    mass = _masses(table)
     good = mass[(table["status"] == Status.OK.value).to_numpy()]
-    typical = float(np.median(np.abs(good))) if good.size else None
+    typical = float(np.median(good)) if good.size else None
     here = _shift(key, config, table, sigma, typical)
     if not recorded:
         share = max(abs(here), abs(here - _peak_shift(key, there, table, sigma)))
@@ -552,7 +543,7 @@ def assumed_error(key: str, config: Config, table: pd.DataFrame) -> Mapping[str,
         share = abs(here - _shift(key, there, table, sigma))
     else:
         share = math.hypot(here, _shift(key, there, table, sigma))
-    return {"mass_kda": share * np.abs(mass)}
+    return {"mass_kda": share * mass}
 
 
 def _of_spheres(
@@ -562,7 +553,7 @@ def _of_spheres(
 
     An index that was fitted is not assumed, and takes its part of what other inputs have wrong.
     """
-    mass = np.abs(table["mass_kda"].to_numpy(float))
+    mass = _masses(table)
     if config.optics.scheme == "darkfield" or not np.isfinite(mass).any():
         return {}
     own = has_own_index(table)
@@ -708,56 +699,40 @@ def budget_of(
     """
     good = table["status"] == Status.OK.value
     rows = table[good] if good.any() else table
-    mass = rows["mass_kda"].abs().to_numpy(float)
-    if not np.isfinite(rows["sigma_mass_kda"].to_numpy(float)).any():
+    mass, noise = _masses(rows), rows["sigma_mass_kda"].to_numpy(float)
+    if not np.isfinite(noise).any():
         return []
-    noise = rows["sigma_mass_kda"].to_numpy(float)
-    remedy = "more light, or more frames of each particle"
-    budget = [
-        _entry("photon noise", "measured", noise, mass, remedy, common=False),
-        _entry(  # 1/SNR² of the mass is taken off, at an SNR that is off by 1
-            "bias of faint particles, taken off", "measured", noise**3 / mass**2, mass, remedy,
-            common=False,
-        ),
-    ]  # fmt: skip
+    own = {"photon noise": noise}
+    own["bias of faint particles, taken off"] = noise**3 / mass**2  # 1/SNR², at an SNR off by 1
+    remedies = dict.fromkeys(own, "more light, or more frames of each particle")
     spread = achieved.get("mass_kda")
-    if (
-        spread is not None
-        and not scaled
-        and spread.significance > _CLEAR_SIGMAS
-        and spread.over_crb > 1
-    ):
-        excess = noise * math.sqrt(spread.over_crb**2 - 1)
-        remedy = 'steadier light or stage; fit.sigma = "measured" puts it into sigma'
-        budget.append(
-            _entry("noise beyond photons", "measured", excess, mass, remedy, common=False)
+    exceeds = spread is not None and spread.significance > _CLEAR_SIGMAS and spread.over_crb > 1
+    if spread is not None and exceeds and not scaled:
+        own["noise beyond photons"] = noise * math.sqrt(spread.over_crb**2 - 1)
+        remedies["noise beyond photons"] = (
+            'steadier light or stage; fit.sigma = "measured" puts it into sigma'
         )
+    budget = [
+        _entry(name, "measured", remedies[name], sigma, mass, common=False)
+        for name, sigma in own.items()
+    ]
+    kept = rows.index.to_numpy()
     common = [
-        _entry(
-            source.name, source.kind, errors["mass_kda"][rows.index.to_numpy()], mass,
-            source.remedy, dof=source.dof,
-        )
-        for source, errors in found
+        _entry(one.name, one.kind, one.remedy, errors["mass_kda"][kept], mass, dof=one.dof)
+        for one, errors in found
         if "mass_kda" in errors
-    ]  # fmt: skip
+    ]
     if unknown is not None:
-        name, remedy = unknown
-        common.append(
-            {
-                "name": name, "kind": "assumed", "common": True,
-                "sigma_mass_kda": None, "sigma_rel": None, "dof": None,
-                "remedy": remedy,
-            }
-        )  # fmt: skip
+        common.append(_entry(unknown[0], "assumed", unknown[1], np.full(mass.size, np.nan), mass))
     return budget + sorted(common, key=lambda one: -(one["sigma_mass_kda"] or math.inf))
 
 
 def _entry(
     name: str,
-    kind: str,
+    kind: Kind,
+    remedy: str,
     sigma: FloatArray,
     mass: FloatArray,
-    remedy: str,
     *,
     common: bool = True,
     dof: float | None = None,

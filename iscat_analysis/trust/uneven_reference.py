@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+import scipy
 
 from iscat_analysis.config import Config
 from iscat_analysis.findings import Finding
@@ -67,10 +68,9 @@ def reference_map(config: Config, table: pd.DataFrame) -> ReferenceMap | None:
     """Find how the amplitude of the reference changes over the field, if masses ask for it."""
     optics = config.optics
     configured = any(optics.field_term(name) for name in TERMS)
-    if configured or optics.scheme == "darkfield" or config.fit.mode == "track":
-        return None
-    shown = set(_NEEDED) <= set(table.columns)
-    if "mass_kda" not in FREE_PARAMETERS[config.fit.mode] or not shown:
+    fitted = "mass_kda" in FREE_PARAMETERS[config.fit.mode] and config.fit.mode != "track"
+    shown = fitted and set(_NEEDED) <= set(table.columns)
+    if configured or optics.scheme == "darkfield" or not shown:
         return None
     good = table[(table["status"] == Status.OK.value) & (table["sigma_mass_kda"] > 0)]
     relative = (good["sigma_mass_kda"] / good["mass_kda"].abs()).sort_values()
@@ -86,10 +86,7 @@ def reference_map(config: Config, table: pd.DataFrame) -> ReferenceMap | None:
     if gain < GAIN or far:
         return None
     rng = np.random.default_rng(len(rows))
-    for _ in range(
-        19
-    ):  # exchanges of places, with each of which the masses must agree clearly less
-        # log-likelihood by which that is so
+    for _ in range(19):  # exchanges of places, with which masses agree clearly less, by 8.0
         if _fitted(mass, sigma, rng.permutation(place))[1] > gain - 8.0:
             return None
     information = -_curvature(mass, sigma, place, terms)
@@ -117,7 +114,6 @@ def _fitted(mass: FloatArray, sigma: FloatArray, place: FloatArray) -> tuple[Flo
 
     Shapes: `mass, sigma` (n,), `place` (n, 3), result (4,).
     """
-    from scipy.optimize import minimize
 
     def worse(terms: FloatArray) -> float:
         return -_agreement(mass, sigma, place, terms)
@@ -125,9 +121,11 @@ def _fitted(mass: FloatArray, sigma: FloatArray, place: FloatArray) -> tuple[Flo
     low, high = (math.log(width) for width in _WIDTHS)
     bounds = [(-_LARGEST, _LARGEST)] * place.shape[1] + [(low, high)]
     widths = np.linspace(low, high, 12)
-    alone = max(_agreement(mass, sigma, place, np.array([0.0, 0.0, 0.0, w])) for w in widths)
+    alone = -min(worse(np.array([0.0, 0.0, 0.0, w])) for w in widths)
     starts = [np.array([0.0, 0.0, 0.0, math.log(width)]) for width in (8.0, 2.0)]
-    fits = [minimize(worse, start, method="L-BFGS-B", bounds=bounds) for start in starts]
+    fits = [
+        scipy.optimize.minimize(worse, start, method="L-BFGS-B", bounds=bounds) for start in starts
+    ]
     best = min(fits, key=lambda fit: float(fit.fun))
     return np.asarray(best.x), -float(best.fun) - alone
 
@@ -156,13 +154,9 @@ def _curvature(
     """
     terms = np.append(terms[:-1], max(terms[-1], 0.0))
     steps = _STEP * np.eye(len(terms))[:-1]
-    out = np.empty((len(steps), len(steps)))
-    for i, one in enumerate(steps):
-        for j, other in enumerate(steps):
-            four = [
-                a * b * _agreement(mass, sigma, place, terms + a * one + b * other)
-                for a in (1, -1)
-                for b in (1, -1)
-            ]
-            out[i, j] = sum(four) / (4 * _STEP**2) / 2
-    return out
+
+    def at(shift: FloatArray) -> float:
+        return _agreement(mass, sigma, place, terms + shift)
+
+    out = [[at(a + b) - at(a - b) - at(b - a) + at(-a - b) for b in steps] for a in steps]
+    return np.array(out) / (8 * _STEP**2)

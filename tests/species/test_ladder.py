@@ -41,7 +41,7 @@ def test_shared_parameters_have_the_slope_that_differences_give(
 ) -> None:
     events = events_of(oligomers)
     found = choice.choose(events)
-    sample, limits = [(events, found.structure)], found.structure.limits
+    sample, limits = [(events, found.structure)], found.structure
     theta = parameters(sample, [found.best]) + 0.3 * limits.scale
     theta = np.minimum(theta, limits.high - limits.scale)
     value, slope = log_likelihood(sample, theta)
