@@ -59,17 +59,10 @@ def bounds_for(setup: Setup, *, mode: str | None = None) -> pd.DataFrame:
     experiment = plan(config)
     truth = np.array([*experiment.theta[:3], experiment.mass_kda])
     limits = limits_at(experiment, free, truth[None])
-    bounds = experiment.bounds(free)
-    index = [PARAMETERS.index(name) for name in free]
-    table = pd.DataFrame(
-        {
-            "crb": limits.crb[0],
-            "crb_single": bounds.crb_single[index],
-            "qcrb": limits.qcrb[0],
-            "holevo": limits.holevo[0],
-        },
-        index=pd.Index(free, name="parameter"),
-    )
+    single = experiment.bounds(free).crb_single[[PARAMETERS.index(name) for name in free]]
+    columns = {"crb": limits.crb[0], "crb_single": single}
+    columns |= {"qcrb": limits.qcrb[0], "holevo": limits.holevo[0]}
+    table = pd.DataFrame(columns, index=pd.Index(free, name="parameter"))
     table.attrs["n_scattered"] = float(experiment.collected)
     return table
 
@@ -125,8 +118,7 @@ def efficiency(
     seed = int(number_in("`seed`", seed, least=0, whole=True))
     columns, truths = matched(_table("estimates", estimates), _table("truth", truth), config, free)
     limits = limits_of_many(config, free, truths)
-    weights = resamples(len(truths), seed)
-    scored = score_estimates(columns, truths, limits, weights)
+    scored = score_estimates(columns, truths, limits, resamples(len(truths), seed))
     if not scored:
         raise DataError(f"estimates: has none of the columns {', '.join(free)}")
     return pd.DataFrame(scored.values(), index=pd.Index(scored.keys(), name="parameter"))
@@ -168,15 +160,12 @@ def limits_of_many(
     height = np.round(truths[:, 2] / _Z_STEP_NM) * _Z_STEP_NM
     with np.errstate(divide="ignore", invalid="ignore"):
         mass = np.exp(np.round(np.log(np.abs(truths[:, 3])) / _MASS_STEP) * _MASS_STEP)
-    pairs = np.array(frames if frames is not None else [(-1, -1)] * len(truths))
+    at = config.bounds
+    pairs = np.array(frames if frames is not None else [(at.n_before, at.n_after)] * len(truths))
     keys = np.column_stack([height, mass, pairs])
     kinds, inverse = np.unique(keys, axis=0, return_inverse=True)
-    at = config.bounds
-    places = np.column_stack(
-        [np.full(len(kinds), at.x_nm), np.full(len(kinds), at.y_nm), kinds[:, :2]]
-    )
-    known = None if frames is None else [(int(a), int(b)) for a, b in kinds[:, 2:]]
-    one = limits_at(experiment, free, places, frames=known)
+    places = np.insert(kinds[:, :2], [0], [at.x_nm, at.y_nm], axis=1)
+    one = limits_at(experiment, free, places, frames=kinds[:, 2:].astype(int).tolist())
     return one.for_rows(inverse.reshape(-1).tolist())
 
 
@@ -219,19 +208,15 @@ def matched(
         )
     if not len(truth):
         raise DataError("truth: has no rows")
-    experiment = {"z_nm": config.bounds.z_nm, "mass_kda": None}
-    if experiment["z_nm"] is None:
-        experiment["z_nm"] = config.particle.nominal_height_nm
+    z_nm = config.particle.nominal_height_nm if config.bounds.z_nm is None else config.bounds.z_nm
+    usual = (
+        {"z_nm": z_nm} if "mass_kda" in truth else {"z_nm": z_nm, "mass_kda": plan(config).mass_kda}
+    )
     truths = np.empty((len(truth), 4))
     for k, name in enumerate(PARAMETERS):
-        if name in truth:
-            truths[:, k] = _numbers(truth, name)
-        elif name in ("x_nm", "y_nm") and name in estimates:
+        if name not in truth and name in estimates and name not in usual:
             raise DataError(f"truth: has no column {name}, which the estimates have")
-        elif name == "mass_kda":
-            truths[:, k] = plan(config).mass_kda
-        else:
-            truths[:, k] = experiment.get(name, 0.0)
+        truths[:, k] = _numbers(truth, name) if name in truth else usual.get(name, 0.0)
     if not np.all(np.isfinite(truths)):
         raise DataError("truth: is not a finite number in every row")
     columns = {

@@ -40,7 +40,7 @@ MOST_GROUPS = 1024
 FINE = 0.2
 """Largest spread of a group in the picture's finest wave [rad]."""
 
-_ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this share
+_ROUNDING = 1e-9  # share by which an exposure may exceed the interval, a line be no line
 _UM2 = 1e6  # nm²
 
 
@@ -269,15 +269,9 @@ def _points(path: FloatArray, groups: int, axes: int, within: float) -> FloatArr
     off = (grouped - mean[:, :, None])[..., :axes]
     covariance = np.einsum("fgpa,fgpb->fgab", off, off) / off.shape[2]
     covariance += within * np.eye(axes)
-    root = np.zeros_like(covariance)  # Cholesky's, also where the path is a straight line
-    for i in range(axes):
-        for j in range(i + 1):
-            rest = covariance[..., i, j] - np.sum(root[..., i, :j] * root[..., j, :j], axis=-1)
-            if i == j:
-                root[..., i, i] = np.sqrt(np.maximum(rest, 0.0))
-            else:
-                pivot = root[..., j, j]
-                root[..., i, j] = np.divide(rest, pivot, out=np.zeros_like(rest), where=pivot > 0)
+    # A path that is a straight line has no covariance across it.
+    whole = np.trace(covariance, axis1=-2, axis2=-1)[..., None, None]
+    root = np.linalg.cholesky(covariance + _ROUNDING * np.maximum(whole, 1e-12) * np.eye(axes))
     offsets = np.zeros((frames, groups, axes, 3))
     offsets[..., :axes] = math.sqrt(axes) * np.swapaxes(root, -1, -2)
     both = np.concatenate([offsets, -offsets], axis=2) + mean[:, :, None]

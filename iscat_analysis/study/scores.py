@@ -20,6 +20,8 @@ from iscat_analysis.records import BoolArray, FloatArray
 MIN_TRIALS = 8
 """Fewer trials have no spread worth stating."""
 
+_NOTHING = (math.nan, math.nan)
+
 PULL_EDGES = np.linspace(-5, 5, 41)
 """Bins of the pull histograms; the outer ones take what lies beyond."""
 
@@ -28,23 +30,23 @@ PULL_EDGES = np.linspace(-5, 5, 41)
 class Score:
     """One parameter of one mode, estimated again and again."""
 
-    bias: float
-    bias_se: float
-    spread: float
-    spread_ci95: tuple[float, float]
-    spread_robust: float
     crb: float
     qcrb: float
-    spread_over_crb: float
-    spread_over_crb_ci95: tuple[float, float]
-    spread_over_qcrb: float
-    spread_over_qcrb_ci95: tuple[float, float]
-    coverage68: float
-    coverage68_ci95: tuple[float, float]
-    coverage95: float
-    coverage95_ci95: tuple[float, float]
-    pull_mean: float
-    pull_std: float
+    bias: float = math.nan
+    bias_se: float = math.nan
+    spread: float = math.nan
+    spread_ci95: tuple[float, float] = _NOTHING
+    spread_robust: float = math.nan
+    spread_over_crb: float = math.nan
+    spread_over_crb_ci95: tuple[float, float] = _NOTHING
+    spread_over_qcrb: float = math.nan
+    spread_over_qcrb_ci95: tuple[float, float] = _NOTHING
+    coverage68: float = math.nan
+    coverage68_ci95: tuple[float, float] = _NOTHING
+    coverage95: float = math.nan
+    coverage95_ci95: tuple[float, float] = _NOTHING
+    pull_mean: float = math.nan
+    pull_std: float = math.nan
 
     def plain(self) -> dict[str, Any]:
         """As nested plain values, for JSON."""
@@ -60,13 +62,12 @@ def score(error: FloatArray, sigma: FloatArray, crb: float, qcrb: float) -> Scor
     error, sigma = error[kept], sigma[kept]
     n = error.size
     if n < MIN_TRIALS:
-        nothing, none = math.nan, (math.nan, math.nan)
-        return Score(
-            nothing, nothing, nothing, none, nothing, crb, qcrb, nothing, none, nothing, none,
-            nothing, none, nothing, none, nothing, nothing,
-        )  # fmt: skip
+        return Score(crb, qcrb)
     spread = float(np.std(error, ddof=1))
     interval = spread_interval(error)
+    over_crb, over_qcrb = (
+        [_ratio(value, bound) for value in (spread, *interval)] for bound in (crb, qcrb)
+    )
     quartiles = np.quantile(error, [0.25, 0.75])
     pull = (error / sigma)[np.isfinite(sigma)]
     narrow, wide = (np.abs(pull) < k for k in (1.0, float(norm.ppf(0.975))))
@@ -78,10 +79,10 @@ def score(error: FloatArray, sigma: FloatArray, crb: float, qcrb: float) -> Scor
         spread_robust=float((quartiles[1] - quartiles[0]) / (2 * norm.ppf(0.75))),
         crb=crb,
         qcrb=qcrb,
-        spread_over_crb=_ratio(spread, crb),
-        spread_over_crb_ci95=(_ratio(interval[0], crb), _ratio(interval[1], crb)),
-        spread_over_qcrb=_ratio(spread, qcrb),
-        spread_over_qcrb_ci95=(_ratio(interval[0], qcrb), _ratio(interval[1], qcrb)),
+        spread_over_crb=over_crb[0],
+        spread_over_crb_ci95=(over_crb[1], over_crb[2]),
+        spread_over_qcrb=over_qcrb[0],
+        spread_over_qcrb_ci95=(over_qcrb[1], over_qcrb[2]),
         coverage68=share(narrow),
         coverage68_ci95=share_interval(narrow),
         coverage95=share(wide),

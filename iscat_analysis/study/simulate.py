@@ -298,11 +298,10 @@ class Movie:
         """Pixels of sample before and after the camera's rows and columns."""
         simulation = self._config.simulation
         measured = simulation.background not in ("flat", "speckle")
-        margins = []
-        for way, size in zip(self.drift_px.T, simulation.shape, strict=True):
+
+        def margin(way: FloatArray, size: int) -> tuple[int, int]:
             if not way.any():
-                margins.append((0, 0))
-                continue
+                return 0, 0
             low, high = math.ceil(max(way.max(), 0)), math.ceil(max(-way.min(), 0))
             if max(low, high) > size:
                 raise ConfigError(
@@ -311,8 +310,10 @@ class Movie:
                 )
             # a measured image is continued by its reflection, of which a whole period closes
             spare = size - low - high if measured else 2 * _MARGIN_PX
-            margins.append((low + spare // 2, high + spare - spare // 2))
-        return margins[0], margins[1]
+            return low + spare // 2, high + spare - spare // 2
+
+        rows, columns = simulation.shape
+        return margin(self.drift_px[:, 0], rows), margin(self.drift_px[:, 1], columns)
 
     def _shifted(self, spectrum: ComplexArray, frame: int) -> FloatArray:
         """Give what the camera sees of the sample in a frame."""
@@ -324,9 +325,12 @@ class Movie:
         return np.asarray(np.maximum(moved[self._field], 0.0))
 
     def _field_of(self, particle: SimulatedParticle, frame: int) -> ComplexArray:
+        return self._field_at(*self._place_nm(particle), particle.z_nm, particle.mass_kda, frame)
+
+    def _place_nm(self, particle: SimulatedParticle) -> tuple[float, float]:
+        """Where a particle is in the sample."""
         dy, dx = self.drift_px[particle.frame]
-        x, y = (particle.x_px - dx) * self._pixel_nm, (particle.y_px - dy) * self._pixel_nm
-        return self._field_at(x, y, particle.z_nm, particle.mass_kda, frame)
+        return (particle.x_px - dx) * self._pixel_nm, (particle.y_px - dy) * self._pixel_nm
 
     def _field_at(
         self, x_nm: float, y_nm: float, z_nm: float, mass_kda: float, frame: int | None = None
@@ -371,12 +375,9 @@ class Movie:
             return np.full(shape, level)
         if simulation.background == "speckle":
             optics = self._config.optics
-            grain_px = 0.21 * optics.wavelength_nm / optics.na / self._pixel_nm
-            noise = gaussian_filter(
-                self._generator("background").standard_normal(shape),
-                max(grain_px, 0.5),
-                mode="wrap",
-            )
+            grain_px = max(0.21 * optics.wavelength_nm / optics.na / self._pixel_nm, 0.5)
+            white = self._generator("background").standard_normal(shape)
+            noise = gaussian_filter(white, grain_px, mode="wrap")
             if self.drift_px.any():
                 noise = self._resolved(noise)
             pattern = 1 + simulation.speckle_contrast * (noise - noise.mean()) / noise.std()
@@ -418,11 +419,8 @@ class Movie:
         """Peak contrast of a particle where it lands, in a field that is not even."""
         if self._local is None or not self._model.rho:
             return None
-        dy, dx = self.drift_px[particle.frame]
-        place = ((particle.x_px - dx) * self._pixel_nm, (particle.y_px - dy) * self._pixel_nm)
-        return self._local.at(*place, particle.frame).peak_contrast(
-            particle.z_nm, particle.mass_kda
-        )
+        local = self._local.at(*self._place_nm(particle), particle.frame)
+        return local.peak_contrast(particle.z_nm, particle.mass_kda)
 
     def _check_range(self) -> None:
         camera = self._camera
@@ -452,19 +450,13 @@ def _counted(
 
 
 def _metadata(config: Config) -> dict[str, object]:
-    camera = config.camera
-    pixel_um = (camera.pixel_size_nm or 0.0) / 1000
-    metadata: dict[str, object] = {
-        "axes": "TYX",
-        "UUID": _NO_UUID,  # a random one would make every file different
-        "PhysicalSizeX": pixel_um,
-        "PhysicalSizeXUnit": "µm",
-        "PhysicalSizeY": pixel_um,
-        "PhysicalSizeYUnit": "µm",
-    }
-    if camera.frame_rate_hz is not None:
-        metadata |= {"TimeIncrement": 1 / camera.frame_rate_hz, "TimeIncrementUnit": "s"}
-    return metadata
+    rate, pixel_um = config.camera.frame_rate_hz, (config.camera.pixel_size_nm or 0.0) / 1000
+    metadata: dict[str, object] = {"axes": "TYX", "UUID": _NO_UUID}  # random, files would differ
+    for axis in "XY":
+        metadata |= {f"PhysicalSize{axis}": pixel_um, f"PhysicalSize{axis}Unit": "µm"}
+    return metadata | (
+        {} if rate is None else {"TimeIncrement": 1 / rate, "TimeIncrementUnit": "s"}
+    )
 
 
 @dataclass(frozen=True)
@@ -485,36 +477,29 @@ def place_particles(config: Config, rng: np.random.Generator) -> tuple[Simulated
     pixel_nm = float(config.camera.pixel_size_nm or math.nan)
     nominal = material(particle, config.optics.wavelength_nm).mass_kda
     if simulation.count is None:
-        return tuple(
-            SimulatedParticle(
-                e.frame, e.leave, e.x_px, e.y_px,
-                _height_nm(particle, e.mass_kda or nominal, rng) if e.z_nm is None else e.z_nm,
-                nominal if e.mass_kda is None else e.mass_kda,
-            )
-            for e in sorted(simulation.events, key=lambda e: e.frame)
-        )  # fmt: skip
+        particles = []
+        for e in sorted(simulation.events, key=lambda e: e.frame):
+            z = _height_nm(particle, e.mass_kda or nominal, rng) if e.z_nm is None else e.z_nm
+            mass = nominal if e.mass_kda is None else e.mass_kda
+            particles.append(SimulatedParticle(e.frame, e.leave, e.x_px, e.y_px, z, mass))
+        return tuple(particles)
     margin = min(config.fit.roi_nm / 2 / pixel_nm, (min(simulation.shape) - 1) / 2)
-    rows, columns = simulation.shape
-    count = simulation.count
-    x = rng.uniform(margin, columns - 1 - margin, count)
-    y = rng.uniform(margin, rows - 1 - margin, count)
+    (rows, columns), count = simulation.shape, simulation.count
+    x = rng.uniform(margin, columns - 1 - margin, count).tolist()
+    y = rng.uniform(margin, rows - 1 - margin, count).tolist()
     first = config.background.recorded
     start = first[1] if first is not None else simulation.frames // 20
-    landing = np.sort(rng.integers(start, max(simulation.frames - start // 2, start + 1), count))
+    ends = start, max(simulation.frames - start // 2, start + 1)
+    landing = np.sort(rng.integers(*ends, count)).tolist()
     species = np.array(simulation.species or (nominal,))
-    mass = rng.permutation(species[np.arange(count) % species.size])
+    masses = rng.permutation(species[np.arange(count) % species.size]).tolist()
     leavers = set(rng.choice(count, simulation.leavings, replace=False).tolist())
     particles = []
-    for i in range(count):
-        latest = simulation.frames - 1
-        leaves = i in leavers and landing[i] + 1 <= latest
-        leave = int(rng.integers(landing[i] + 1, latest + 1)) if leaves else None
-        particles.append(
-            SimulatedParticle(
-                int(landing[i]), leave, float(x[i]), float(y[i]),
-                _height_nm(particle, float(mass[i]), rng), float(mass[i]),
-            )
-        )  # fmt: skip
+    for i, (frame, mass) in enumerate(zip(landing, masses, strict=True)):
+        leaves = i in leavers and frame + 1 < simulation.frames
+        leave = int(rng.integers(frame + 1, simulation.frames)) if leaves else None
+        z = _height_nm(particle, mass, rng)
+        particles.append(SimulatedParticle(frame, leave, x[i], y[i], z, mass))
     return tuple(particles)
 
 

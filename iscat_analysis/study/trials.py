@@ -6,21 +6,16 @@ number of threads nor on how the trials are dealt to them.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iscat_analysis.inference.fit import compile_kernels, fit_particle, parts_of
 from iscat_analysis.records import BoolArray, FitResult, FloatArray, Status
 from iscat_analysis.study.setting import Setting
 from iscat_analysis.threads import threads
-
-CHUNK = 16
-"""Trials that a thread takes at a time."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +28,8 @@ class Trials:
     truth: FloatArray
     estimate: FloatArray
     sigma: FloatArray
-    status: NDArray[np.str_]
     flags: tuple[frozenset[str], ...]
     p_value: FloatArray
-    chi2_reduced: FloatArray
-    gap: FloatArray
     seconds: float
     start: FloatArray
     counts_e: FloatArray | None = None
@@ -82,7 +74,6 @@ def run_trials(
     seed: int,
     stream: int = 0,
     workers: int = 1,
-    chunk: int = CHUNK,
     truths: FloatArray | None = None,
     keep_counts: bool = False,
     correct_bias: bool = True,
@@ -93,55 +84,40 @@ def run_trials(
     Shapes: `truths` (count, 4).
     """
     truth = np.tile(setting.truth, (count, 1)) if truths is None else np.array(truths, dtype=float)
-    estimate, sigma = np.full((count, 4), np.nan), np.full((count, 4), np.nan)
     begin = np.empty((count, 4))
     counts = np.empty((2, count, setting.pixels, setting.pixels)) if keep_counts else None
-    p_value, chi2, gap = (np.full(count, np.nan) for _ in range(3))
-    fits: list[FitResult | None] = [None] * count
     compile_kernels(setting.context.model, parts_of(setting.free, posteriors=False))
 
-    def work(first: int) -> float:
-        spent = 0.0
-        last = min(first + chunk, count)
-        for i in range(first, last):
-            random = trial_generator(seed, stream, i)
-            windows = setting.draw(truth[i], random)
-            likelihood = setting.likelihood(windows)
-            start = setting.start(truth[i], random)
-            begun = time.thread_time()
-            fit = fit_particle(
-                likelihood, start, setting.mode, setting.config.fit.z_range_nm,
-                level=setting.level, correct_bias=correct_bias,
-            )  # fmt: skip
-            spent += time.thread_time() - begun
-            fits[i] = fit
-            estimate[i] = fit.x_nm, fit.y_nm, fit.z_nm, fit.mass_kda
-            sigma[i] = fit.sigma
-            p_value[i], chi2[i] = fit.p_value, fit.chi2_reduced
-            gap[i] = fit.alternatives[0].log_likelihood_gap if fit.alternatives else math.inf
-            place = np.array([start.x_px, start.y_px]) * setting.context.pixel_nm
-            begin[i] = *place, start.z_nm, start.mass_kda
-            if counts is not None:
-                counts[:, i] = windows.before_e, windows.after_e
+    def work(i: int) -> tuple[FitResult, float]:
+        random = trial_generator(seed, stream, i)
+        windows = setting.draw(truth[i], random)
+        likelihood, start = setting.likelihood(windows), setting.start(truth[i], random)
+        begun = time.thread_time()
+        fit = fit_particle(
+            likelihood, start, setting.mode, setting.config.fit.z_range_nm,
+            level=setting.level, correct_bias=correct_bias,
+        )  # fmt: skip
+        spent = time.thread_time() - begun
+        place = np.array([start.x_px, start.y_px]) * setting.context.pixel_nm
+        begin[i] = *place, start.z_nm, start.mass_kda
+        if counts is not None:
+            counts[:, i] = windows.before_e, windows.after_e
         if advance is not None:
-            advance(last - first)
-        return spent
+            advance(1)
+        return fit, spent
 
     with threads(workers) as pool:
-        seconds = sum(pool.map(work, range(0, count, chunk)))
-    found = [fit for fit in fits if fit is not None]
-    estimate, sigma = setting.in_diameters(estimate, sigma)
+        fits, seconds = zip(*pool.map(work, range(count)), strict=True)
+    found = np.array([(fit.x_nm, fit.y_nm, fit.z_nm, fit.mass_kda) for fit in fits])
+    estimate, sigma = setting.in_diameters(found, np.array([fit.sigma for fit in fits]))
     truth, _ = setting.in_diameters(truth, sigma)
     return Trials(
         truth=truth,
         estimate=estimate,
         sigma=sigma,
-        status=np.array([str(fit.status) for fit in found]),
-        flags=tuple(frozenset(str(flag) for flag in fit.flags) for fit in found),
-        p_value=p_value,
-        chi2_reduced=chi2,
-        gap=gap,
-        seconds=seconds,
+        flags=tuple(frozenset(str(flag) for flag in fit.flags) for fit in fits),
+        p_value=np.array([fit.p_value for fit in fits]),
+        seconds=sum(seconds),
         start=begin,
         counts_e=counts,
     )

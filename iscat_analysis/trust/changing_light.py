@@ -14,8 +14,9 @@ the rises of bright particles show whether this may happen.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -253,13 +254,13 @@ class Fluctuation:
         longest = 4.0 * float(np.median(frames[:, 1]))
         taus = _CORRELATIONS[max(longest, _CORRELATIONS[0]) >= _CORRELATIONS]
         window = float(np.median(there[good]))
-        noise = _Noise.of(pooled, window, squares[:, 0], counts[:, 0], frames[:, 0])
-        evidence = _Evidence.of(
-            squares[:, 1], counts[:, 1], frames[:, 1], (mass**2 / one)[good], taus, noise
-        )
-        if evidence.factor <= 1:
+        noise = _noise(pooled, window, squares[:, 0], counts[:, 0], frames[:, 0])
+        of_after = squares[:, 1], counts[:, 1], frames[:, 1], (mass**2 / one)[good]
+        weight = _log_ratio(*of_after, taus, noise)
+        if logsumexp(weight) <= math.log(weight.size):  # some fluctuation is no likelier than none
             return None
-        posterior = evidence.posterior
+        weight += math.log(_PRIOR / weight.size)
+        posterior = np.exp(weight - np.logaddexp(logsumexp(weight), math.log1p(-_PRIOR)))
         variance = _RELATIVE[:, None] ** 2
         numbers, which = np.unique(there.astype(np.int64), return_inverse=True)
         left = np.array([[_of_mean(n, tau) for tau in taus] for n in numbers.tolist()])
@@ -287,143 +288,91 @@ class Fluctuation:
     @property
     def summary(self) -> Mapping[str, Any]:
         """The section of ``summary.json``."""
-        return {
-            "probability": self.probability,
-            "relative": self.relative,
-            "relative_se": self.relative_se,
-            "frames": self.frames,
-        }
+        return {name: value for name, value in vars(self).items() if name != "variance_kda2"}
 
 
-@dataclass(frozen=True)
-class _Noise:
-    """Mean square of the components where there is no particle.
+InBins = Callable[[int, int], FloatArray]
+"""From a number of frames and of bins of their components to a mean square in each, (bins,)."""
+
+
+def _noise(
+    pooled: EmpiricalSpread,
+    window: float,
+    squares: FloatArray,
+    counts: FloatArray,
+    frames: NDArray[np.int64],
+) -> InBins:
+    """Measure the mean square of the components where there is no particle.
 
     Up to half a window it is that between blocks of frames at empty places.  Slower noise is that
     of the events' own places before they land or after they leave.
+
+    Shapes: `squares, counts` (events, bins), `frames` (events,).
     """
+    levels = np.square(pooled.empty[1:-1] or pooled.empty[:1])
+    measured = np.ldexp(window / 8, np.arange(levels.size))
 
-    lengths: FloatArray
-    levels: FloatArray
-    slow: float = 1.0
+    def in_bins(frames: int, bins: int, slow: float = 1.0) -> FloatArray:
+        lengths = frames / (2 * _modes(frames, bins))
+        level = np.interp(lengths, measured, levels)
+        return _binned(np.where(lengths > 4 * measured[0], level * slow, level), bins)
 
-    @classmethod
-    def of(
-        cls,
-        pooled: EmpiricalSpread,
-        window: float,
-        squares: FloatArray,
-        counts: FloatArray,
-        frames: NDArray[np.int64],
-    ) -> _Noise:
-        """Measure it.
-
-        Shapes: `squares, counts` (events, bins), `frames` (events,).
-        """
-        levels = np.square(pooled.empty[1:-1] or pooled.empty[:1])
-        fast = cls(np.ldexp(window / 8, np.arange(levels.size)), levels)
-        excess = number = _KNOWN
-        for square, count, n in zip(squares, counts, frames.tolist(), strict=True):
-            bins = int((count > 0).sum())
-            if not bins:
-                continue
+    excess = number = _KNOWN
+    for square, count, n in zip(squares, counts, frames.tolist(), strict=True):
+        bins = int((count > 0).sum())
+        if bins:
             slow = n / (2 * np.array(MODES[:bins])) > window / 2
-            expected = fast.in_bins(n, bins)
-            excess += float(np.sum((square[:bins] / expected)[slow]))
+            excess += float(np.sum((square[:bins] / in_bins(n, bins))[slow]))
             number += float(count[:bins][slow].sum())
-        return cls(fast.lengths, levels, excess / number)
-
-    def in_bins(self, frames: int, bins: int) -> FloatArray:
-        """Give it for every bin of so many frames.
-
-        Shapes: result (bins,).
-        """
-        modes, starts = _modes(frames, bins)
-        lengths = frames / (2 * modes)
-        level = np.interp(lengths, self.lengths, self.levels)
-        level = np.where(lengths > 4 * self.lengths[0], level * self.slow, level)
-        return np.asarray(np.add.reduceat(level, starts) / _held(modes, starts))
+    return partial(in_bins, slow=excess / number)
 
 
-@dataclass(frozen=True)
-class _Evidence:
-    """Likelihoods of s and τ over that of no fluctuation, from all events.
+def _log_ratio(
+    squares: FloatArray,
+    counts: FloatArray,
+    frames: NDArray[np.int64],
+    strength: FloatArray,
+    taus: FloatArray,
+    noise: InBins,
+) -> FloatArray:
+    """Logarithms of the likelihoods of s and τ over that of no fluctuation, from all events.
 
-    Shapes: `log_ratio` (s, τ).
+    Shapes: `squares, counts` (events, bins), `frames, strength` (events,), `taus` (τ,), result
+    (s, τ).
     """
-
-    log_ratio: FloatArray
-
-    @classmethod
-    def of(
-        cls,
-        squares: FloatArray,
-        counts: FloatArray,
-        frames: NDArray[np.int64],
-        strength: FloatArray,
-        taus: FloatArray,
-        noise: _Noise,
-    ) -> _Evidence:
-        """Compare the spectra with the noise and with every fluctuation.
-
-        Shapes: `squares, counts` (events, bins), `frames, strength` (events,), `taus` (τ,).
-        """
-        total = np.zeros((_RELATIVE.size, taus.size))
-        expected: dict[tuple[int, int], tuple[FloatArray, FloatArray]] = {}
-        for square, count, n, snr2 in zip(squares, counts, frames.tolist(), strength, strict=True):
-            held = count > 0
-            if not held.any():
-                continue
-            key = n, int(held.sum())
-            if key not in expected:
-                expected[key] = noise.in_bins(*key), _of_unit(*key, taus)
-            level, shape = expected[key]
-            signal = snr2 * _RELATIVE[:, None, None] ** 2 * shape / level
-            gain = square[held] / level * signal / (1 + signal) - count[held] * np.log1p(signal)
-            ratio = 0.5 * gain.sum(axis=2)
-            alone = logsumexp(ratio) - math.log(ratio.size)
-            own = math.log(_ALONE) + alone
-            total += np.logaddexp(math.log1p(-_ALONE) + ratio, own)
-            total -= np.logaddexp(math.log1p(-_ALONE), own)
-        return cls(total)
-
-    @property
-    def factor(self) -> float:
-        """Bayes factor of some fluctuation over none."""
-        return math.exp(min(float(logsumexp(self.log_ratio)) - math.log(self.log_ratio.size), 500))
-
-    @property
-    def posterior(self) -> FloatArray:
-        """Probability of every s and τ; what is missing to 1 is that of no fluctuation.
-
-        Shapes: result (s, τ).
-        """
-        weight = self.log_ratio + math.log(_PRIOR / self.log_ratio.size)
-        whole = np.logaddexp(logsumexp(weight), math.log1p(-_PRIOR))
-        return np.asarray(np.exp(weight - whole))
+    total = np.zeros((_RELATIVE.size, taus.size))
+    expected: dict[tuple[int, int], tuple[FloatArray, FloatArray]] = {}
+    for square, count, n, snr2 in zip(squares, counts, frames.tolist(), strength, strict=True):
+        held = count > 0
+        if not held.any():
+            continue
+        key = n, int(held.sum())
+        if key not in expected:
+            of_unit = np.stack([_components(_modes(*key), n, tau) for tau in taus])
+            expected[key] = noise(*key), _binned(of_unit, key[1])
+        level, shape = expected[key]
+        signal = snr2 * _RELATIVE[:, None, None] ** 2 * shape / level
+        gain = square[held] / level * signal / (1 + signal) - count[held] * np.log1p(signal)
+        ratio = 0.5 * gain.sum(axis=2)
+        own = math.log(_ALONE) + logsumexp(ratio) - math.log(ratio.size)
+        total += np.logaddexp(math.log1p(-_ALONE) + ratio, own)
+        total -= np.logaddexp(math.log1p(-_ALONE), own)
+    return total
 
 
-def _modes(frames: int, bins: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Give the numbers of the components of so many frames, and where each bin of them begins.
+def _modes(frames: int, bins: int) -> NDArray[np.int64]:
+    """Give the numbers of the components of so many frames that are in bins."""
+    return np.arange(1, min(frames, MODES[bins]))
 
-    Shapes: results (modes,), (bins,).
+
+def _binned(values: FloatArray, bins: int) -> FloatArray:
+    """Average over the components of every bin.
+
+    Shapes: `values` (…, modes), result (…, bins).
     """
-    return np.arange(1, min(frames, MODES[bins])), np.array(MODES[:bins]) - 1
-
-
-def _held(modes: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Count the components of every bin."""
-    return np.diff(np.append(starts, modes.size))
-
-
-def _of_unit(frames: int, bins: int, taus: FloatArray) -> FloatArray:
-    """Mean square of the components in every bin of an ε of unit variance.
-
-    Shapes: `taus` (τ,), result (τ, bins).
-    """
-    modes, starts = _modes(frames, bins)
-    shape = np.stack([_components(modes, frames, tau) for tau in taus])
-    return np.asarray(np.add.reduceat(shape, starts, axis=1) / _held(modes, starts))
+    starts = np.array(MODES[:bins]) - 1
+    sizes = np.diff(np.append(starts, values.shape[-1]))
+    return np.asarray(np.add.reduceat(values, starts, axis=-1) / sizes)
 
 
 def _components(modes: NDArray[np.int64], frames: int, tau: float) -> FloatArray:

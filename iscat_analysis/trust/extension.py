@@ -114,27 +114,19 @@ class Extension:
             left, per_mass = _beside_learned_optics(config, table)
         mean, error = _mean(q[many], se[many])
         mean, error = mean / left, error / left
-        length = _Length.of(*(part[many] for part in evidence[7:10]))
+        length_nm2, sigmas, shows_length = _length(*(part[many] for part in evidence[7:10]))
         moved, moved_se = _wiggle(table[many], in_time, config.particle.wiggle_nm)
-        found = (
-            (mean, mean / error),
-            (length.variance_nm2, length.significance),
-            (moved, moved / moved_se),
-        )
-        clear = [variance for variance, sigmas in found if sigmas > _SIGNIFICANT]
+        found = ((mean, mean / error), (length_nm2, sigmas), (moved, moved / moved_se))
+        clear = [variance for variance, beyond in found if beyond > _SIGNIFICANT]
         is_common = bool(clear and many.sum() >= FEWEST)
         prior_sd = config.uncertainty.wiggle_nm
         if is_common:  # a narrow prior would pull a clear width towards zero
             # standard deviation of the prior over a √v that is clear
             prior_sd = max(prior_sd, 2.0 * math.sqrt(max(clear)))
-        middle, sd = _posterior(
-            (mean, error), prior_sd, length.log_likelihood, _normal(moved, moved_se)
-        )
-        slope: FloatArray = (
-            np.abs(np.nan_to_num(evidence.mass_per_spread))
-            if per_mass is None
-            else per_mass * table["mass_kda"].abs().to_numpy(float)
-        )
+        middle, sd = _posterior((mean, error), prior_sd, shows_length, _normal(moved, moved_se))
+        slope = np.abs(np.nan_to_num(evidence.mass_per_spread))
+        if per_mass is not None:
+            slope = per_mass * table["mass_kda"].abs().to_numpy(float)
         shift = slope * math.hypot(middle, sd)
         flagged = known & (q > 0) & (np.nan_to_num(evidence.chi2_spread) > chdtri(3, _CHANCE))
         if is_common:
@@ -142,7 +134,7 @@ class Extension:
             flagged = flagged | (known & too_light)
         across, along, error_across = evidence[7:10]
         squares = np.nan_to_num((across**2 + along**2) / error_across**2)
-        is_long = is_common and length.significance > _SIGNIFICANT
+        is_long = is_common and sigmas > _SIGNIFICANT
         long = known & (squares > chdtri(2, _CHANCE))
         return cls(mean, error, middle, sd, is_common, is_long, long, flagged, shift)
 
@@ -247,58 +239,33 @@ def _mean(q: FloatArray, se: FloatArray) -> tuple[float, float]:
     return float(np.average(q, weights=weight)), 1 / math.sqrt(float(weight.sum()))
 
 
-@dataclass(frozen=True)
-class _Length:
-    """Elongation of images, each in its own direction; a common elongation comes from the optics.
+def _length(
+    across: FloatArray, along: FloatArray, sigma: FloatArray
+) -> tuple[float, float, LogLikelihood]:
+    """Measure how long images are, each in its own direction.
 
-    Attributes
-    ----------
-    squares : float
-        Sum of (across² + along²)/σ², of which noise alone has `dof` on average.
-    precision : float
-        Sum of 1/σ² [1/nm⁴].
+    A common elongation comes from the optics.  Particles that are far longer than most are left
+    out.  Gives half of the difference between the variances along both axes [nm²], its significance
+    in standard deviations of a normal law, and its log-likelihood: the sum of squares follows a
+    noncentral χ² law, which is normal for many events.
+
+    Shapes: `across, along, sigma` (n,).
     """
+    parts = [part - _mean(part, sigma)[0] for part in (across, along)]
+    each = (parts[0] ** 2 + parts[1] ** 2) / sigma**2
+    kept = each <= np.median(each) * _OUTLIER_SIGMAS**2
+    squares, dof = float(each[kept].sum()), 2 * max(int(kept.sum()) - 1, 0)
+    precision = float((sigma[kept] ** -2.0).sum())  # [1/nm⁴]
 
-    squares: float = 0.0
-    dof: int = 0
-    precision: float = 0.0
-
-    @classmethod
-    def of(cls, across: FloatArray, along: FloatArray, sigma: FloatArray) -> _Length:
-        """Sum over particles, without those that are far longer than most.
-
-        Shapes: `across, along, sigma` (n,).
-        """
-        parts = [part - _mean(part, sigma)[0] for part in (across, along)]
-        squares = (parts[0] ** 2 + parts[1] ** 2) / sigma**2
-        kept = squares <= np.median(squares) * _OUTLIER_SIGMAS**2
-        n = int(kept.sum())
-        return cls(
-            float(squares[kept].sum()), 2 * max(n - 1, 0), float((sigma[kept] ** -2.0).sum())
-        )
-
-    @property
-    def variance_nm2(self) -> float:
-        """Half of the difference between the variances along both axes [nm²]."""
-        return math.sqrt(max(self.squares - self.dof, 0.0) / self.precision)
-
-    @property
-    def significance(self) -> float:
-        """Significance of the elongation, in standard deviations of a normal law."""
-        return -float(ndtri(chdtrc(self.dof, self.squares))) if self.dof else 0.0
-
-    def log_likelihood(self, variance: FloatArray) -> FloatArray:
-        """Log-likelihood of half the difference between the variances along both axes.
-
-        The sum of squares follows a noncentral χ² law, which is normal for many events.
-
-        Shapes: `variance` (n,), result (n,).
-        """
-        if not self.dof:
+    def log_likelihood(variance: FloatArray) -> FloatArray:
+        if not dof:
             return np.zeros(variance.size)
-        beyond = variance**2 * self.precision
-        spread = 2 * self.dof + 4 * beyond
-        return -0.5 * ((self.squares - self.dof - beyond) ** 2 / spread + np.log(spread))
+        beyond = variance**2 * precision
+        spread = 2 * dof + 4 * beyond
+        return -0.5 * ((squares - dof - beyond) ** 2 / spread + np.log(spread))
+
+    significance = -float(ndtri(chdtrc(dof, squares))) if dof else 0.0
+    return math.sqrt(max(squares - dof, 0.0) / precision), significance, log_likelihood
 
 
 def _wiggle(

@@ -108,21 +108,22 @@ class Response:
 
         With the index of the sphere free, that takes its part of the difference.
         """
-        theta = self.theta(z_nm, amplitude)
-        signal, _ = self.model.signal(self.grid, theta[:4])
-        further = self._along_index(theta) if index else []
-        whole = joint_information(self.expected(theta), theta, (), [signal, *further])
-        count = 1 + len(further)
-        chosen = np.concatenate([np.arange(count), count + self._kept])
-        moved = imitation(whole[np.ix_(chosen, chosen)], 1)
-        return -float(moved[len(further) + self._row_of_mass, 0]) / amplitude
+        signal, _ = self.model.signal(self.grid, self.theta(z_nm, amplitude)[:4])
+        return self.to_input(signal, amplitude, z_nm=z_nm, index=index).amplitude
 
     @property
     def faint_amplitude(self) -> float:
         """Amplitude of a particle whose scattered light alone is negligible."""
         return _FAINT / peak_per_amplitude(self.model)
 
-    def to_input(self, derivative: FloatArray, amplitude: float, *, index: bool = False) -> Shifts:
+    def to_input(
+        self,
+        derivative: FloatArray,
+        amplitude: float,
+        *,
+        z_nm: float | None = None,
+        index: bool = False,
+    ) -> Shifts:
         """Shift of ln a and of the optics where images differ by a derivative from the model.
 
         Parameters of the optics that were learned from such images imitate the difference as far
@@ -131,7 +132,7 @@ class Response:
 
         Shapes: `derivative` (ny, nx).
         """
-        theta = self.theta(self.model.height_nm, amplitude)
+        theta = self.theta(self.model.height_nm if z_nm is None else z_nm, amplitude)
         further = self._along_index(theta) if index else []
         others = [derivative, *further]
         whole = joint_information(self.expected(theta), theta, self.names, others)
@@ -142,7 +143,7 @@ class Response:
         information = eliminated(whole, count)
         optics = self._learned(information[1:, 1:], information[1:, 0])
         moved = imitation(whole, count)
-        row = len(further) + self._row_of_mass
+        row = len(further) + int(np.flatnonzero(self._kept == PARAMETERS.index("mass_kda"))[0])
         left = 1 - float(information[0, 1:] @ optics) / float(information[0, 0])
         return Shifts(float(moved[row, 1:] @ optics - moved[row, 0]) / amplitude, optics, left)
 
@@ -186,10 +187,6 @@ class Response:
         known = self.model.sphere.index.real
         slopes = SphereOfIndex(self.model).signal(self.grid, (x, y, z, amplitude, known))[1]
         return [slopes[-1]]
-
-    @property
-    def _row_of_mass(self) -> int:
-        return int(np.flatnonzero(self._kept == PARAMETERS.index("mass_kda"))[0])
 
     @property
     def _kept(self) -> NDArray[np.intp]:

@@ -130,11 +130,11 @@ def _finite_if_ok(fit: FitResult) -> None:
 
 
 @pytest.mark.parametrize("scheme", ["iscat", "darkfield"])
-def test_threads_and_chunks_change_nothing(scheme: str) -> None:
+def test_threads_change_nothing(scheme: str) -> None:
     experiment = setting(scheme, "joint")
     reference = run_trials(experiment, 40, seed=SEED, workers=1)
-    for workers, chunk in ((2, 16), (5, 1), (3, 7), (1, 40)):
-        again = run_trials(experiment, 40, seed=SEED, workers=workers, chunk=chunk)
+    for workers in (2, 3, 5):
+        again = run_trials(experiment, 40, seed=SEED, workers=workers)
         for item in fields(reference):
             if item.name == "seconds":
                 continue
