@@ -19,6 +19,7 @@ from itertools import pairwise
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri, stdtr, stdtrit
 
 from iscat_analysis.answers.binding import (
@@ -110,7 +111,9 @@ class Means:
     freedom: float
 
 
-def sample_means(values: FloatArray, errors: FloatArray, sample: Sequence[int]) -> Means:
+def sample_means(
+    values: FloatArray, errors: FloatArray, sample: Sequence[int] | NDArray[np.int64]
+) -> Means:
     """Average the movies of each sample.
 
     Shapes: `values, errors` (n,).
@@ -154,28 +157,15 @@ def shifts(species: pd.DataFrame, reference: str) -> pd.DataFrame:
     width = (species["share_high"] - species["share_low"]) / (2 * TWO_SIDED_95)
     species = species.assign(share_se=width)
     for kind, rows in species[species["kind"] > 0].groupby("kind", sort=True):
-        names = list(dict.fromkeys(rows["sample"]))
-        number = [names.index(name) for name in rows["sample"]]
-        conditions = [rows["condition"][rows["sample"] == name].iloc[0] for name in names]
-        mass = float(np.average(rows["mass_kda"]))
+        number, names = pd.factorize(rows["sample"])
+        labels = {"kind": kind, "kind_mass_kda": float(rows["mass_kda"].mean()), "sample": names}
+        labels["condition"] = rows.drop_duplicates("sample")["condition"].to_numpy()
         for quantity, error in (("mass_kda", "mass_se"), ("share", "share_se")):
             means = sample_means(
                 rows[quantity].to_numpy(float), rows[error].to_numpy(float), number
             )
-            table = pd.DataFrame(
-                {
-                    "kind": kind,
-                    "kind_mass_kda": mass,
-                    "sample": names,
-                    "condition": conditions,
-                    "reference": reference,
-                    "quantity": quantity,
-                    "value": means.value,
-                    "se": means.se,
-                    "movies": means.movies,
-                    "scatter": means.scatter,
-                }
-            )
+            values = {name: getattr(means, name) for name in ("value", "se", "movies", "scatter")}
+            table = pd.DataFrame(labels | {"reference": reference, "quantity": quantity} | values)
             found.append(_compared(table, means, reference))
     if not found:
         return pd.DataFrame(columns=list(SHIFT_COLUMNS))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from iscat_analysis.config import Config, load_config
+from iscat_analysis.config import Config, configure, load_config
 from iscat_analysis.day.calibrate import Day
 from iscat_analysis.day.jobs import Outcome
 from iscat_analysis.day.table import Movie, Plan
@@ -61,23 +61,26 @@ class Found:
     movie: Movie
     outcome: Outcome
     folder: Path
-    summary: Mapping[str, Any]
-    masses_kda: FloatArray
-    p_values: FloatArray
-    config: Config | None
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    masses_kda: FloatArray = field(default_factory=lambda: np.empty(0))
+    p_values: FloatArray = field(default_factory=lambda: np.empty(0))
+    config: Config = field(default_factory=configure)
 
     @property
     def labels(self) -> dict[str, Any]:
         """The columns `LABELS`."""
-        row = self.movie.row
-        return {
-            "movie": self.movie.name,
-            "sample": row.sample,
-            "condition": row.condition,
-            "concentration_nm": row.concentration_nm,
-            "replicate": row.replicate,
-            "role": row.role,
-        }
+        row = {name: getattr(self.movie.row, name) for name in LABELS[1:]}
+        return {"movie": self.movie.name, **row}
+
+    @property
+    def distribution(self) -> Mapping[str, Any]:
+        """What the summary says of species; empty where there are none."""
+        return self.summary.get("distribution") or {}
+
+    @property
+    def background(self) -> Mapping[str, Any]:
+        """What the summary says of light and drift."""
+        return self.summary.get("landing") or self.summary.get("background") or {}
 
     @property
     def frames_searched(self) -> float:
@@ -90,24 +93,31 @@ class Found:
     @property
     def seconds(self) -> float:
         """The same as a time [s]; NaN where the frame rate is not known."""
-        rate = self.config.camera.frame_rate_hz if self.config is not None else None
-        return self.frames_searched / rate if rate else math.nan
+        return self.frames_searched / (self.config.camera.frame_rate_hz or math.nan)
 
     @property
     def field_um2(self) -> float:
         """Area of the frame [µm²]; NaN where it is not known."""
         shape = (self.outcome.record or {}).get("shape")
-        pixel = self.config.camera.pixel_size_nm if self.config is not None else None
+        pixel = self.config.camera.pixel_size_nm
         return float(shape[1] * shape[2] * (pixel / 1e3) ** 2) if shape and pixel else math.nan
+
+    @property
+    def noise(self) -> tuple[float | None, int | None]:
+        """Noise over that of photoelectrons at the length of a movie's windows, and that length."""
+        noise = self.background
+        frames, values = noise.get("noise_frames"), noise.get("noise_variance_over_shot")
+        known = [(n, v) for n, v in zip(frames or (), values or (), strict=True) if v is not None]
+        window = noise.get("window_frames", math.inf)
+        fitting = [(n, v) for n, v in known if n <= window] or known[:1]
+        return (float(fitting[-1][1]), int(fitting[-1][0])) if fitting else (None, None)
 
 
 def read_movie(movie: Movie, outcome: Outcome, folder: Path) -> Found:
     """Read what the tables and figures need of a result."""
-    nothing = np.empty(0)
     if outcome.state != "done" or movie.row.role == "flat":
-        return Found(movie, outcome, folder, {}, nothing, nothing, None)
+        return Found(movie, outcome, folder)
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    config = load_config(folder / "config.toml")
     events = pd.read_parquet(folder / "fits.parquet", columns=list(_MASSES))
     kept = events[events["status"].isin([Status.OK, Status.POOR_FIT])]
     if (folder / "tracks.parquet").is_file():
@@ -115,20 +125,18 @@ def read_movie(movie: Movie, outcome: Outcome, folder: Path) -> Found:
     else:
         good = events[events["status"] == Status.OK]
     good = good if summary["mode"] != "localize" else good[:0]
-    mass = good["mass_kda"].to_numpy(float)
-    p_values = kept["p_value"].to_numpy(float)
+    masses, p_values = good["mass_kda"].dropna(), kept["p_value"].dropna()
+    config = load_config(folder / "config.toml")
     return Found(
-        movie, outcome, folder, summary, mass[np.isfinite(mass)],
-        p_values[np.isfinite(p_values)], config,
-    )  # fmt: skip
+        movie, outcome, folder, summary, masses.to_numpy(float), p_values.to_numpy(float), config
+    )
 
 
 def species_table(found: Sequence[Found]) -> pd.DataFrame:
     """Put the species of all movies into one table."""
     rows = []
     for each in found:
-        described = each.summary.get("distribution") or {}
-        known = [s for s in described.get("species", ()) if not s.get("background")]
+        known = [s for s in each.distribution.get("species", ()) if not s.get("background")]
         for species, share in zip(known, shares_of(known), strict=True):
             values = {key: species.get(key) for key in SPECIES_COLUMNS if key in species}
             seen = poisson_rate(species["landing"], each.seconds)
@@ -193,19 +201,17 @@ def _numbers(each: Found, day: Day, out: Path) -> dict[str, Any]:
     if not each.summary:
         return {"cautions": ""}
     summary, landing = each.summary, each.summary.get("landing", {})
-    quality = judge(each.movie, each.summary, each.config, each.masses_kda, each.p_values, day)
-    species = (summary.get("distribution") or {}).get("species", ())
-    counted = [s for s in species if not s["outlier"]]
+    counted = [s for s in each.distribution.get("species", ()) if not s["outlier"]]
     main = max(counted, key=lambda s: s["count"], default=None)
     rate, low, high = poisson_rate(landing.get("landings"), each.seconds)
-    noise, frames = noise_of(summary)
+    noise, frames = each.noise
     return {
         "report": (each.folder / "report.html").relative_to(out).as_posix(),
         "events": summary["events"],
         "ok": summary["status"].get("ok", 0),
         "landings": landing.get("landings"),
         "leavings": landing.get("leavings"),
-        "species": len(counted) if summary.get("distribution") else None,
+        "species": len(counted) if each.distribution else None,
         "main_mass_kda": main["mass_kda"] if main else None,
         "answer": answer_in(each.folder),
         "rate_per_s": rate,
@@ -220,7 +226,7 @@ def _numbers(each: Found, day: Day, out: Path) -> dict[str, Any]:
         "noise_frames": frames,
         "remarks": len(summary["warnings"]),
         "sha256": summary["input"]["sha256"],
-        **quality,
+        **_quality(each, day),
     }
 
 
@@ -284,48 +290,28 @@ NEAR_STANDARD = 0.05
 """Relative distance within which a species is a standard, where its interval is narrower."""
 
 
-def noise_of(summary: Mapping[str, Any]) -> tuple[float | None, int | None]:
-    """Find the noise at the length of the movie's windows."""
-    noise = summary.get("landing") or summary.get("background") or {}
-    frames, values = noise.get("noise_frames"), noise.get("noise_variance_over_shot")
-    known = [(n, v) for n, v in zip(frames or (), values or (), strict=True) if v is not None]
-    window = noise.get("window_frames", math.inf)
-    fitting = [(n, v) for n, v in known if n <= window] or known[:1]
-    return (float(fitting[-1][1]), int(fitting[-1][0])) if fitting else (None, None)
-
-
-def judge(
-    movie: Movie,
-    summary: Mapping[str, Any],
-    config: Config | None,
-    masses_kda: FloatArray,
-    p_values: FloatArray,
-    day: Day,
-) -> dict[str, Any]:
-    """Describe the quality of one movie.
-
-    Shapes: `masses_kda` (n,), `p_values` (n,).
-    """
+def _quality(each: Found, day: Day) -> dict[str, Any]:
+    """Describe the quality of one movie."""
+    summary, masses_kda, p_values = each.summary, each.masses_kda, each.p_values
     cautions: list[str] = []
-    noise, frames = noise_of(summary)
+    noise, frames = each.noise
     if noise is not None and noise > LARGEST_NOISE_RATIO:
         cautions.append(f"noise {noise:.2g} times shot noise at {frames} frames")
-    landing = summary.get("landing") or summary.get("background") or {}
-    drift = landing.get("drift_px")
+    drift = each.background.get("drift_px")
     moved = float(np.hypot(*drift)) if drift and None not in drift else None
-    if moved is not None and moved > FAR_PX and not landing.get("drift_corrected"):
+    if moved is not None and moved > FAR_PX and not each.background.get("drift_corrected"):
         cautions.append(f"the pattern drifts {moved:.1f} px")
     small = float(np.mean(p_values < SMALL_P)) if p_values.size else None
     if small is not None and small > MOST_SMALL_P_SHARE and p_values.size >= FEW_EVENTS:
         cautions.append(f"{100 * small:.0f} % of p-values below {SMALL_P:g}")
     if summary.get("repeats", {}).get("understated"):
         cautions.append("σ is smaller than the measured spread")
-    if summary["events"] < FEW_EVENTS and movie.row.role != "blank":
+    if summary["events"] < FEW_EVENTS and each.movie.row.role != "blank":
         cautions.append(f"{count(summary['events'], 'event')}, too few for species")
-    optics, focus = _optics(summary, config, day)
+    optics, focus = _optics(each, day)
     if optics.startswith(("learned from this", "rejected")):
         cautions.append(f"optics {optics}")
-    scale = _scale(summary, config, day)
+    scale = _scale(each, day)
     if "mass" in dict(day.failed) and scale.startswith("as configured"):
         cautions.append("mass scale as configured, because the day's calibration failed")
     if scale.startswith(("none", "another")):
@@ -336,7 +322,7 @@ def judge(
         cautions.append(
             f"{100 * outside:.0f} % of masses are beyond the standards, {low:g} to {high:g} kDa"
         )
-    seen = _standards_seen(movie, summary, day)
+    seen = _standards_seen(each, day)
     if seen and seen[0] < seen[1]:
         cautions.append(f"{seen[0]} of {count(seen[1], 'standard')} among the species")
     precision = summary.get("precision", {}).get("mass_kda", {})
@@ -354,19 +340,16 @@ def judge(
     }
 
 
-def _optics(
-    summary: Mapping[str, Any], config: Config | None, day: Day
-) -> tuple[str, float | None]:
+def _optics(each: Found, day: Day) -> tuple[str, float | None]:
     """Say where the optics are from, and by how much the focus was moved."""
-    optics = summary.get("optics")
-    source = "of the day" if day.settings.get("optics.focus_nm") is not None else "as configured"
-    if config is not None and config.optics.file is not None:
+    optics, reference = each.summary.get("optics"), day.settings.get("optics.focus_nm")
+    source = "of the day" if reference is not None else "as configured"
+    if each.config.optics.file is not None:
         source = "of a file"
     if not optics:
         return f"{source}, not tested", None
-    if optics.get("calibrated") and config is not None:
-        reference = day.settings.get("optics.focus_nm")
-        shift = None if reference is None else config.optics.focus_nm - float(reference)
+    if optics.get("calibrated"):
+        shift = None if reference is None else each.config.optics.focus_nm - float(reference)
         return "learned from this movie", shift
     if "tested" not in optics:
         return f"{source}, too few bright particles to test them", None
@@ -375,12 +358,11 @@ def _optics(
     return f"{source}, confirmed", None
 
 
-def _scale(summary: Mapping[str, Any], config: Config | None, day: Day) -> str:
+def _scale(each: Found, day: Day) -> str:
     """Say where the mass scale is from."""
-    used = config.calibration if config is not None else None
-    if summary["mass_scale"] != "calibration" or used is None:
+    used, line = each.config.calibration, day.settings.get("calibration")
+    if each.summary["mass_scale"] != "calibration" or used is None:
         return "none: the model's own"
-    line = day.settings.get("calibration")
     if line is None:
         return "as configured, not of this day"
     same = math.isclose(used.gradient_per_kda, line["gradient_per_kda"])
@@ -396,18 +378,18 @@ def _outside(masses_kda: FloatArray, day: Day) -> float | None:
     return float(np.mean((size < 0.9 * low) | (size > 1.1 * high)))
 
 
-def _standards_seen(movie: Movie, summary: Mapping[str, Any], day: Day) -> tuple[int, int] | None:
+def _standards_seen(each: Found, day: Day) -> tuple[int, int] | None:
     """Count the standards of a calibrant that are among its species."""
-    wanted = [mass for mass, _ in movie.row.standards] or list(day.standards_kda)
-    described = summary.get("distribution")
-    if movie.row.role != "calibrant" or not day.standards_kda or not described:
+    row = each.movie.row
+    wanted = [mass for mass, _ in row.standards] or list(day.standards_kda)
+    if row.role != "calibrant" or not day.standards_kda or not each.distribution:
         return None
-    species = [s for s in described["species"] if not s["outlier"]]
-    seen = 0
-    for mass in wanted:
-        for each in species:
-            reach = max(NEAR_STANDARD * mass, 3 * (each["mass_se"] or 0.0))
-            if abs(each["mass_kda"] - mass) <= reach:
-                seen += 1
-                break
+    species = [s for s in each.distribution["species"] if not s["outlier"]]
+    seen = sum(
+        any(
+            abs(s["mass_kda"] - mass) <= max(NEAR_STANDARD * mass, 3 * (s["mass_se"] or 0.0))
+            for s in species
+        )
+        for mass in wanted
+    )
     return seen, len(wanted)

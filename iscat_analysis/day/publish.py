@@ -138,7 +138,7 @@ def _group(each: Found) -> str:
 
 
 def _curve(each: Found, group: str) -> Curve:
-    curves = (each.summary.get("distribution") or {}).get("curves", {})
+    curves = each.distribution.get("curves", {})
     grid, density = (np.array(curves.get(key, ()), dtype=float) for key in ("mass_kda", "density"))
     return Curve(
         each.movie.name, each.movie.row.sample, group, np.abs(each.masses_kda), grid, density
@@ -150,7 +150,6 @@ def reference_of(found: Sequence[Found]) -> str:
     described = (
         each.movie.row.sample
         for each in found
-        if each.movie.row.role == "sample"
-        and (each.summary.get("distribution") or {}).get("species")
+        if each.movie.row.role == "sample" and each.distribution.get("species")
     )
     return next(described, "")

@@ -399,21 +399,17 @@ def _spread_start(events: Events, k: int) -> Mixture:
 
 def split_starts(events: Events, fit: Mixture) -> list[Mixture]:
     """Add a narrow species at the largest excess of events."""
-    starts = []
-    sigma = float(np.median(events.sigma))
-    places = np.sort(events.x)
-    every = np.arange(fit.narrow)
-    whole = np.sqrt(fit.variance + sigma**2)
+    starts, places, sigma = [], np.sort(events.x), float(np.median(events.sigma))
+    whole, every = np.sqrt(fit.variance + sigma**2), np.arange(fit.narrow)
     widths = [sigma]
     if not events.plain:  # the errors may be unknown, and those of the peaks are not
         widths.append(float(whole[every].min()) / 2)
     for h in widths:
         near = np.searchsorted(places, places + h) - np.searchsorted(places, places - h)
-        expected = np.zeros(places.size)
-        for w, m, total in zip(fit.weight, fit.mean, whole, strict=True):
-            expected += w * (ndtr((places + h - m) / total) - ndtr((places - h - m) / total))
-        excess = (near - places.size * expected) / np.sqrt(places.size * expected + 1)
-        place = float(places[int(np.argmax(excess))])
+        away = places[:, None] - fit.mean
+        share = (ndtr((away + h) / whole) - ndtr((away - h) / whole)) @ fit.weight
+        expected = places.size * share
+        place = float(places[int(np.argmax((near - expected) / np.sqrt(expected + 1)))])
         starts.append(_replaced(fit, every, 1 / (2 * fit.narrow + 1), place, (h / 2) ** 2))
     return starts
 

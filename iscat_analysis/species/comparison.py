@@ -203,27 +203,23 @@ class _Hypothesis:
         k, theta = self.known, full.theta
         covariance, mixtures = full.covariance(), self.mixtures(theta)
         fractions, slopes = zip(*(self._fractions(i, theta) for i in (0, 1)), strict=True)
-        slope = slopes[1] - slopes[0]
+        difference, slope = fractions[1] - fractions[0], slopes[1] - slopes[0]
         error = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slope, covariance, slope), 0.0))
-        shift, shift_se = np.full(k, math.nan), np.full(k, math.nan)
-        relative_se = np.full(k, math.nan)
         first = mixtures[0]
-        at_mean, at_shift = self.at_mean, self.at_mean + first.narrow
         mean = peaks(self.structures[0][0], first)
-        for number, i in enumerate(self.moves):
-            place = at_shift + number
-            shift[i] = theta[place]
-            if not covariance[place, place] > 0:  # at an end of its range
-                continue
-            shift_se[i] = math.sqrt(covariance[place, place])
+        shift, shift_se, relative_se = (np.full(k, math.nan) for _ in range(3))
+        places = self.at_mean + first.narrow + np.arange(self.moves.size)
+        variance = np.diag(covariance)[places]
+        shift[self.moves] = theta[places]
+        shift_se[self.moves] = np.sqrt(np.where(variance > 0, variance, math.nan))  # at an end: NaN
+        for i, place in zip(self.moves, places, strict=True):
             ratio = np.zeros(theta.size)  # of δ/μ
             ratio[place] = 1 / mean[i]
             own = np.flatnonzero(first.kinds == i)
             part = first.weight[own] / first.weight[own].sum()
-            ratio[at_mean + own] = -theta[place] / mean[i] ** 2 * part
+            ratio[self.at_mean + own] = -theta[place] / mean[i] ** 2 * part
             relative_se[i] = math.sqrt(max(float(ratio @ covariance @ ratio), 0.0))
-        relative = shift / mean
-        difference = fractions[1] - fractions[0]
+        relative_se[np.isnan(shift_se)] = math.nan
         counts = [
             mixture.shares(events).sum(axis=0)[:k]
             for mixture, (events, _) in zip(mixtures, self.structures, strict=True)
@@ -231,13 +227,14 @@ class _Hypothesis:
         columns = {
             "mass_kda": mean,
             "mass_other_kda": np.where(moves, mean + shift, math.nan),
-            **_interval("shift", "shift_kda", shift, shift_se),
-            "shift_percent": 100 * relative,
-            "shift_percent_low": 100 * (relative - TWO_SIDED_95 * relative_se),
-            "shift_percent_high": 100 * (relative + TWO_SIDED_95 * relative_se),
+            "shift_kda": shift,
+            **_errors("shift", shift, shift_se),
+            "shift_percent": 100 * shift / mean,
+            **_errors("shift_percent", 100 * shift / mean, 100 * relative_se),
             "fraction": fractions[0],
             "fraction_other": fractions[1],
-            **_interval("difference", "difference", difference, error),
+            "difference": difference,
+            **_errors("difference", difference, error),
             "count": counts[0],
             "count_other": counts[1],
         }
@@ -254,12 +251,6 @@ class _Hypothesis:
         return part, part[:, None] * (logits - part @ logits)
 
 
-def _interval(
-    name: str, value_name: str, value: FloatArray, error: FloatArray
-) -> dict[str, FloatArray]:
-    return {
-        value_name: value,
-        f"{name}_se": error,
-        f"{name}_low": value - TWO_SIDED_95 * error,
-        f"{name}_high": value + TWO_SIDED_95 * error,
-    }
+def _errors(name: str, value: FloatArray, error: FloatArray) -> dict[str, FloatArray]:
+    reach = TWO_SIDED_95 * error
+    return {f"{name}_se": error, f"{name}_low": value - reach, f"{name}_high": value + reach}

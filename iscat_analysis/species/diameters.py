@@ -124,11 +124,11 @@ def describe_sizes(
     power = _power(diameter, sigma)
     events = Events(np.log(diameter / UNIT_NM), sigma / diameter, None, plain=True)
     measured, choice = events, Searched()
-    found = choice.choose(events)
+    best = choice.choose(events).best
     for _ in range(_TURNS):
-        events = _beside(measured, power, found.best)
+        events = _beside(measured, power, best)
         found = choice.choose(events)
-    best = found.best
+        best = found.best
     limits, k = [Possible(1.0, events, best, found.structure)], best.mean.size
     repeats, support = bootstrap(limits, found, draws=draws, least=LEAST_EVENTS, seed=seed)
     middle = interval_of([r.mixture.mean for r in repeats], k)
@@ -203,11 +203,9 @@ def _beside(measured: Events, power: float, population: Mixture) -> Events:
 def _curve(events: Events, best: Mixture) -> pd.DataFrame:
     """Give the density per nm that the populations and the errors make."""
     reach = _MARGIN * float(np.median(events.sigma))
-    diameter = np.linspace(
-        math.exp(events.x.min() - reach), math.exp(events.x.max() + reach), _POINTS
-    )
-    x = np.log(diameter)
-    density = events.x.size * mean_density(events, best, x) / diameter
+    ends = np.exp([events.x.min() - reach, events.x.max() + reach])
+    diameter = np.linspace(*ends, _POINTS)
+    density = events.x.size * mean_density(events, best, np.log(diameter)) / diameter
     return pd.DataFrame({"diameter_nm": UNIT_NM * diameter, "model": density / UNIT_NM})
 
 

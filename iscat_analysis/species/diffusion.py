@@ -147,16 +147,11 @@ def gather(
             f"frame to frame at frame_rate_hz = {frame_rate_hz:g}: correct one of them"
         )
     when = real_array("frames", frames)
-    if when.ndim != 1 or when.size < LEAST_POSITIONS:
+    listed = when.ndim == 1 and when.size >= LEAST_POSITIONS and np.abs(when).max() < _MOST_FRAMES
+    if not listed or (when % 1).any() or not (np.diff(when) > 0).all():
         raise DataError(
-            f"frames: has shape {when.shape}; give the frame number of each of at least "
-            f"{LEAST_POSITIONS} positions"
-        )
-    whole = (np.abs(when) < _MOST_FRAMES) & (when == np.round(when))
-    if not whole.all() or not (np.diff(when) > 0).all():
-        raise DataError(
-            "frames: give whole numbers that increase, each frame once; frames without a position "
-            "are left out"
+            f"frames: give the frame number of each of at least {LEAST_POSITIONS} positions, whole "
+            "numbers that increase; frames without a position are left out"
         )
     places = real_array("positions_nm", positions_nm)
     places = places[:, np.newaxis] if places.ndim == 1 else places
@@ -188,14 +183,11 @@ def gather(
             "that say nothing beside the others"
         )
     going = np.ones(when.size - 1, bool) if counted is None else array_of("counted", counted)
-    if going.shape != (when.size - 1,) or going.dtype != bool:
+    told = going.shape == (when.size - 1,) and going.dtype == bool
+    if not told or going.sum() < LEAST_POSITIONS - 1:
         raise DataError(
-            f"counted: has shape {going.shape} of {going.dtype}; give ({when.size - 1},) of bool, "
-            "one for each displacement"
-        )
-    if going.sum() < LEAST_POSITIONS - 1:
-        raise DataError(
-            f"counted: leaves {going.sum()} displacements of {LEAST_POSITIONS - 1} that are needed"
+            f"counted: give ({when.size - 1},) of bool, one for each displacement, at least "
+            f"{LEAST_POSITIONS - 1} of them True"
         )
     return Displacements(
         positions_nm=np.ascontiguousarray(places.T),

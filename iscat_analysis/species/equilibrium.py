@@ -56,7 +56,7 @@ from itertools import product
 from typing import Literal
 
 import numpy as np
-from scipy.special import chdtrc, expit
+from scipy.special import chdtrc, expit, logit
 
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.events import Events
@@ -240,12 +240,8 @@ class _Equilibrium:
             added.append(("inactive", 0.0, _MOST_INACTIVE, 0.05, 0.1))
         self.names, *numbers = zip(*added, strict=True)
         self.at = series.own
-        self.low, self.high, self.first, self.scale = (
-            np.append(old[: self.at], new)
-            for old, new in zip(
-                (series.low, series.high, series.first, series.scale), numbers, strict=True
-            )
-        )
+        of_series = np.array([series.low, series.high, series.first, series.scale])
+        self.low, self.high, self.first, self.scale = np.hstack([of_series[:, : self.at], numbers])
 
     def constants(self, theta: FloatArray) -> dict[str, float]:
         """Name what stands in place of the logits."""
@@ -256,10 +252,11 @@ class _Equilibrium:
         return np.concatenate([theta[: self.at], self._logits(theta[self.at :])])
 
     def _logits(self, constants: FloatArray) -> FloatArray:
-        values = dict(zip(self.names, constants.tolist(), strict=True))
+        values = {"power": self.power, "inactive": 0.0}
+        values |= dict(zip(self.names, constants.tolist(), strict=True))
         found = landing_logits(
-            self.model, self.totals, math.exp(values["ln_kd"]), values.get("inactive", 0.0),
-            self.series.masses, values["power"] if self.power is None else self.power,
+            self.model, self.totals, math.exp(values["ln_kd"]), values["inactive"],
+            self.series.masses, values["power"],
         )  # fmt: skip
         return found[:, 1:].ravel()
 
@@ -317,16 +314,13 @@ class _Equilibrium:
 
 def _observed(series: Series, free: Maximum) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Logit of the complexes of each table, its standard error, and their fraction."""
-    covariance = free.covariance()
     part = np.exp(series.logits(free.theta))
     part /= part.sum(axis=1, keepdims=True)
-    logits, errors = np.empty(series.number), np.empty(series.number)
-    for number, one in enumerate(part):
-        logits[number] = math.log(one[-1] / (1 - one[-1]))
-        slope = np.append(-one[1:-1] / (1 - one[-1]), 1.0)  # d logit(f_k)/dl_j
-        own = slice(series.own + number * slope.size, series.own + (number + 1) * slope.size)
-        errors[number] = math.sqrt(max(float(slope @ covariance[own, own] @ slope), 1e-12))
-    return logits, errors, expit(logits)
+    number, own = part.shape[0], part.shape[1] - 1
+    slopes = np.hstack([-part[:, 1:-1] / (1 - part[:, -1:]), np.ones((number, 1))])  # d logit/dl_j
+    blocks = free.covariance()[series.own :, series.own :].reshape(number, own, number, own)
+    variance = np.einsum("ti,titj,tj->t", slopes, blocks, slopes)
+    return logit(part[:, -1]), np.sqrt(np.maximum(variance, 1e-12)), part[:, -1]
 
 
 def _profiled(
@@ -353,38 +347,26 @@ def _interval(
     """
     at, found, problem = equilibrium.at, maxima[0], equilibrium.problem()
     best, least, most = float(found.theta[at]), float(problem.low[at]), float(problem.high[at])
-    different: list[Maximum] = []
-    for one in maxima:
-        if all(abs(one.value - other.value) > _SAME for other in different):
-            different.append(one)
-    branches = [{float(one.theta[at]): one} for one in different]
+    branches = [{float(one.theta[at]): one} for one in maxima]
 
     @cache
     def deviance(ln_kd: float) -> float:
-        climbed: list[tuple[float, Maximum, Maximum]] = []
+        climbed: dict[int, Maximum] = {}
         for branch in branches:
-            place = min(branch, key=lambda place: abs(place - ln_kd))
-            nearest = branch[place]
-            for other, begun, top in climbed:
-                if other == place and abs(begun.value - nearest.value) < _SAME:
-                    branch[ln_kd] = top
-                    break
-            else:
+            nearest = branch[min(branch, key=lambda place: abs(place - ln_kd))]
+            if id(nearest) not in climbed:
                 low, high, start = problem.low.copy(), problem.high.copy(), nearest.theta.copy()
                 low[at] = high[at] = start[at] = ln_kd
-                held = replace(problem, low=low, high=high)
-                branch[ln_kd] = maximise(held, start, nearest.curvature)
-                climbed.append((place, nearest, branch[ln_kd]))
-        return 2 * max(found.value - max(branch[ln_kd].value for branch in branches), 0.0)
+                top = maximise(replace(problem, low=low, high=high), start, nearest.curvature)
+                met = (one for one in climbed.values() if abs(one.value - top.value) < _SAME)
+                climbed[id(nearest)] = next(met, top)
+            branch[ln_kd] = climbed[id(nearest)]
+        return 2 * max(found.value - max(one.value for one in climbed.values()), 0.0)
 
     first = TWO_SIDED_95 * float(found.errors()[at])
     low, high = interval(deviance, best, least, most, step=max(first, _FIRST_STEP))
     grid = np.unique(np.append(np.linspace(low, high, _PROFILE), best))
     points = np.column_stack([grid, [deviance(float(value)) for value in grid]])
-    reached = (point for branch in branches for point in branch.values())
-    ends = (
-        math.exp(low) if low > least else 0.0,
-        math.exp(high) if high < most else math.inf,
-        points,
-    )
-    return ends, max(reached, key=lambda one: one.value)
+    reached = max((one for branch in branches for one in branch.values()), key=lambda m: m.value)
+    ends = math.exp(low) if low > least else 0.0, math.exp(high) if high < most else math.inf
+    return (*ends, points), reached

@@ -128,11 +128,8 @@ def maximise(problem: Problem, start: FloatArray, near: FloatArray | None = None
     search.errordef, search.strategy, search.tol = Minuit.LIKELIHOOD, _FAST, _TOLERANCE
     search.errors = _STEP * problem.scale
     search.print_level = _SILENT
-    for place, (low, high) in enumerate(zip(problem.low, problem.high, strict=True)):
-        if low == high:
-            search.fixed[place] = True
-        else:
-            search.limits[place] = low, high
+    search.limits = list(zip(problem.low, problem.high, strict=True))
+    search.fixed = problem.low == problem.high
     search.migrad()
     theta = np.array(search.values)
     edge = _AT_LIMIT * reach

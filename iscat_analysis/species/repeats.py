@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-from scipy.special import log_ndtr, ndtri_exp
+from scipy.special import log_ndtr, ndtri_exp, softmax
 
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.choices import (
@@ -97,20 +97,20 @@ def possible_edges(events: Events, found: Chosen, least: float) -> list[Possible
     width = math.hypot(float(best.widths()[first]), math.sqrt(events.usual_variance))
     lowest = np.sort(events.x)[:_LOWEST]
     gap = float(np.ptp(lowest)) / max(lowest.size - 1, 1)
-    tried = [(math.log(_FAR), best, events, found.structure)]
-    near = Possible(1.0, events, best, found.structure).curvature
+    tried = [Possible(math.log(_FAR) + best.log_likelihood, events, best, found.structure)]
+    near = tried[0].curvature
 
     def at(limit: float, soft: float, part: float, start: Mixture) -> tuple[float, Mixture]:
         edge = replace(events, efficiency=Edge.at(limit, soft))
         structure = found.structure if found.held else free_structure(edge, best)
         fit = fit_jointly(edge, start, structure, near)
         prior = math.log((1 - _FAR) * max(part, 1e-9) / (_PLACES.size * len(_SOFT)))
-        tried.append((prior, fit, edge, structure))
+        tried.append(Possible(prior + fit.log_likelihood, edge, fit, structure))
         return prior + fit.log_likelihood, fit
 
     if gap > 0:
         at(float(lowest[0]) * (1 - _JUST_BELOW), 0.0, min(gap / (_STEP * width), 1.0), best)
-    highest = max(prior + fit.log_likelihood for prior, fit, *_ in tried)
+    highest = max(one.probability for one in tried)
     for soft in _SOFT:
         fit, last = best, -math.inf
         for limit in middle + _PLACES * width:
@@ -121,14 +121,10 @@ def possible_edges(events: Events, found: Chosen, least: float) -> list[Possible
             if value < min(highest - _HOPELESS, last):
                 break
             last = value
-    height = np.array([prior + fit.log_likelihood for prior, fit, *_ in tried])
-    chance: FloatArray = np.exp(height - height.max())
-    chance /= chance.sum()
-    order = [i for i in np.argsort(-chance, kind="stable") if chance[i] > _LEAST]
-    total = chance[order].sum()
-    return [
-        Possible(float(chance[i] / total), tried[i][2], tried[i][1], tried[i][3]) for i in order
-    ]
+    chance: FloatArray = softmax([one.probability for one in tried])  # of their logarithms
+    kept = [i for i in np.argsort(-chance, kind="stable") if chance[i] > _LEAST]
+    total = chance[kept].sum()
+    return [replace(tried[i], probability=float(chance[i] / total)) for i in kept]
 
 
 def ratio_of_doubt(possible: list[Possible]) -> FloatArray:
@@ -139,13 +135,10 @@ def ratio_of_doubt(possible: list[Possible]) -> FloatArray:
     """
     weight = np.array([one.probability for one in possible])
     species = possible[0].mixture.species
+    seen = np.array([one.mixture.detected(one.events)[:species] for one in possible])
+    came = np.array([one.mixture.came[:species] for one in possible])
     ratios = np.full(species, np.inf)
-    for values in (
-        np.array([one.mixture.detected(one.events)[:species] for one in possible]),
-        np.array(
-            [one.mixture.came[:species] / one.mixture.came[:species].sum() for one in possible]
-        ),
-    ):
+    for values in (seen, came / came.sum(axis=1, keepdims=True)):
         for number, column in enumerate(values.T):
             order = np.argsort(column)
             ends = np.searchsorted(np.cumsum(weight[order]), ENDS_95)

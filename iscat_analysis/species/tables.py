@@ -65,6 +65,7 @@ _RANGES = {
 }  # fmt: skip
 """The columns of numbers that are used, and how large their magnitudes can be."""
 
+_OF_EVENTS = ("mass_kda", "sigma_kda", "frame", "x_px", "y_px")
 _REJECTED = "rejected_by_hand"  # true of events that somebody left out
 _NAMED = 3  # tables that a note names
 
@@ -164,16 +165,16 @@ def event_table(
         raise ConfigError("`limit_sigma_kda` is the spread of a limit; give `limit_kda` as well")
     if isinstance(events, EventTable):
         return events
-    if isinstance(events, pd.DataFrame):
-        called = name or "table"
-        table = named(events, called)
-    elif isinstance(events, (str, Path)):
-        called = name or str(events)
-        table = read_events(Path(events))
-    else:
+    if not isinstance(events, (pd.DataFrame, str, Path)):
         raise ConfigError(
             f"`events`: is {type(events).__name__}; give the path of a table, or a pandas.DataFrame"
         )
+    if isinstance(events, pd.DataFrame):
+        called = name or "table"
+        table = named(events, called)
+    else:
+        called = name or str(events)
+        table = read_events(Path(events))
     file = table.attrs.get("file")
     findings = [AS_READ({"text": note}) for note in table.attrs["notes"]]
     if line is not None:
@@ -187,8 +188,7 @@ def event_table(
     if "status" not in table and (doubt := unit_note(table["mass_kda"].to_numpy(float))):
         findings.append(AS_READ({"text": doubt}))
     table = _checked(table)
-    found = _usable(table, called, sigma_kda)
-    efficiency = found.efficiency
+    found, efficiency = _usable(table, called, sigma_kda), None
     if above_kda is not None:
         found = _cut(found, above_kda)
         efficiency = _sharp(above_kda)
@@ -314,17 +314,11 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
         limits = {"least": least, "most": most}
         findings.append(NO_MASS({"amount": count(missing, "event"), "advice": advice, **limits}))
     rows = good[known]
-    window = (
-        int(rows["n_after"].max()) if "n_after" in rows and rows["n_after"].notna().any() else 0
-    )
+    window = rows["n_after"].max() if "n_after" in rows else 0
     return EventTable(
         name,
-        mass[known],
-        sigma[known],
-        frame[known],
-        x[known],
-        y[known],
-        window_frames=window or None,
+        *(values[known] for values in (mass, sigma, frame, x, y)),
+        window_frames=int(np.nan_to_num(window)) or None,
         scale_error=shared_error(rows),
         findings=tuple(findings),
     )
@@ -335,14 +329,7 @@ def _cut(found: EventTable, above_kda: float) -> EventTable:
     kept = np.abs(found.mass_kda) > above_kda
     if not kept.any():
         raise DataError(f"{found.name}: no event lies above `above_kda` = {above_kda:g}")
-    columns = ("mass_kda", "sigma_kda", "frame", "x_px", "y_px")
-    return replace(found, **{name: getattr(found, name)[kept] for name in columns})
-
-
-def _edge(values: FloatArray) -> float:
-    """Lower end of a distribution: the smallest value, less the mean distance of values near it."""
-    few = np.sort(values)[:_NEAR_EDGE]
-    return float(few[0] - (few[-1] - few[0]) / max(few.size - 1, 1))
+    return replace(found, **{name: getattr(found, name)[kept] for name in _OF_EVENTS})
 
 
 def _sharp(edge_kda: float) -> Efficiency:
@@ -354,10 +341,11 @@ def _from_snr(table: pd.DataFrame, path: Path | None) -> Efficiency | None:
     """Estimate threshold and noise of the filter from a table of this program."""
     good = species_rows(table)[0] if "status" in table else table
     snr = good["snr"].to_numpy(dtype=float)
-    snr = snr[np.isfinite(snr) & (snr > 0)]
-    if not snr.size:
+    few = np.sort(snr[np.isfinite(snr) & (snr > 0)])[:_NEAR_EDGE]
+    if not few.size:
         return None
-    threshold, searched = _edge(snr), 1.0
+    # The smallest value, less the mean distance of values near it.
+    threshold, searched = float(few[0] - np.ptp(few) / max(few.size - 1, 1)), 1.0
     if path is not None:
         try:
             summary = read_json(path.parent / "summary.json")

@@ -58,13 +58,12 @@ def measure_spread(
     own = np.stack(kept)[:, :BLOCK_ROWS]
     found: dict[str, EmpiricalSpread] = {}
     for k, name in enumerate(FREE_PARAMETERS[mode]):
+        mine = own[:, :, [k, -1]]
         if empty is None:
-            one = pooled(own[:, :, [k, -1]], None, None)
+            one = pooled(mine, None, None)
         else:
-            one = pooled(
-                own[:, :, [k, -1]], empty.squares[:, k], empty.counts,
-                shared=float(empty.shared[k]), distances=empty.distances,
-            )  # fmt: skip
+            shared, squares = float(empty.shared[k]), empty.squares[:, k]
+            one = pooled(mine, squares, empty.counts, shared=shared, distances=empty.distances)
         if one is not None:
             found[name] = one
     return found

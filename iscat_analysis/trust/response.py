@@ -315,8 +315,5 @@ def height_weights(
 
 def lagrange(nodes: FloatArray, points: FloatArray) -> FloatArray:
     """Weights of the polynomial through values at the nodes, shape (points, nodes)."""
-    weights = np.ones((points.size, nodes.size))
-    for k, node in enumerate(nodes):
-        for other in np.delete(nodes, k):
-            weights[:, k] *= (points - other) / (node - other)
-    return weights
+    through = scipy.interpolate.BarycentricInterpolator(nodes, np.eye(nodes.size))
+    return np.asarray(through(points))
