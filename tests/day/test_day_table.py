@@ -45,11 +45,9 @@ def test_csv_keeps_every_column(folder: Path) -> None:
 @pytest.mark.parametrize("delimiter", [";", "\t"])
 def test_csv_as_spreadsheets_write_it(folder: Path, delimiter: str) -> None:
     text = "Path,Role\n\n# a remark\na.tif,blank\nb.tif\n".replace(",", delimiter)
-    table = read_table(_csv(folder, text, "utf-8-sig"))
-    assert [(row.given, row.role, row.where) for row in table.rows] == [
-        ("a.tif", "blank", "line 4"),
-        ("b.tif", "sample", "line 5"),
-    ]
+    rows = read_table(_csv(folder, text, "utf-8-sig")).rows
+    expected = [("a.tif", "blank", "line 4"), ("b.tif", "sample", "line 5")]
+    assert [(row.given, row.role, row.where) for row in rows] == expected
 
 
 def test_toml_is_the_same_table(folder: Path) -> None:
