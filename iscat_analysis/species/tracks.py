@@ -218,19 +218,19 @@ _MASS_TOLERANCE = 1e-9  # of the mass
 
 @dataclass(frozen=True)
 class CommonMass:
-    """The mass of a track."""
+    """The mass of a track, by the columns of ``tracks.csv``."""
 
     mass_kda: float
     sigma_mass_kda: float
     crb_mass_kda: float
-    scatter: float
-    p_value: float
-    frames: int
+    mass_scatter: float
+    p_mass: float
+    n_mass_frames: int
 
     @property
     def enlargement(self) -> float:
         """Factor by which frames scatter beyond their errors (Birge, Phys. Rev. 40, 207, 1932)."""
-        return max(self.scatter, 1.0) if self.frames > 1 else 1.0
+        return max(self.mass_scatter, 1.0) if self.n_mass_frames > 1 else 1.0
 
 
 def combine_masses(
@@ -266,9 +266,9 @@ def combine_masses(
         mass_kda=mass,
         sigma_mass_kda=float(weights.sum() ** -0.5),
         crb_mass_kda=float(weights_at(mass, crb_kda).sum() ** -0.5),
-        scatter=math.sqrt(inside / free) if free else math.nan,
-        p_value=float(chdtrc(free, inside)) if free else math.nan,
-        frames=mass_kda.size,
+        mass_scatter=math.sqrt(inside / free) if free else math.nan,
+        p_mass=float(chdtrc(free, inside)) if free else math.nan,
+        n_mass_frames=mass_kda.size,
     )
 
 
@@ -554,14 +554,7 @@ class _Track:
             **{axis: of_known(np.mean, getattr(rows, axis)) for axis in ("x_nm", "y_nm", "z_nm")},
         }
         if self.mass is not None:
-            record |= {
-                "n_mass_frames": self.mass.frames,
-                "mass_kda": self.mass.mass_kda,
-                "sigma_mass_kda": self.mass.sigma_mass_kda,
-                "crb_mass_kda": self.mass.crb_mass_kda,
-                "mass_scatter": self.mass.scatter,
-                "p_mass": self.mass.p_value,
-            }
+            record |= vars(self.mass)
         known = {name: value for name, value in self.exact.items() if np.isfinite(value)}
         known_share = known.pop("told", 1.0)
         record |= known

@@ -105,10 +105,14 @@ class Setting:
     @property
     def experiment_in_region(self) -> Experiment:
         """The experiment with its field where the region is, whose first pixel lies at 0 nm."""
-        grid = PixelGrid.region(self.region.rows, self.region.columns, self.context.pixel_nm)
         theta = self.experiment.theta.copy()
         theta[:2] = self.truth[:2]
-        return replace(self.experiment, model=self.context.model, grid=grid, theta=theta)
+        return replace(self.experiment, model=self.context.model, grid=self._grid, theta=theta)
+
+    @property
+    def _grid(self) -> PixelGrid:
+        """Pixels of the region."""
+        return PixelGrid.region(self.region.rows, self.region.columns, self.context.pixel_nm)
 
     def level_e(self) -> float:
         """Return the expected background per pixel and frame [e]."""
@@ -118,13 +122,11 @@ class Setting:
 
     def signal_e(self, truth: FloatArray) -> FloatArray:
         """Return the counts that the particle adds to one frame, shape (ny, nx) [e]."""
-        model = self.context.model
-        grid = PixelGrid.region(self.region.rows, self.region.columns, self.context.pixel_nm)
-        signal = model.image(grid, *(float(v) for v in truth))
+        model, photons = self.context.model, self.config.bounds.photons_per_pixel
+        signal = model.image(self._grid, *(float(v) for v in truth))
         if self.context.additive:
-            photons = self.config.bounds.photons_per_pixel
             return signal * photons_per_intensity(model, photons, self.context.pixel_nm)
-        return signal * self.config.bounds.photons_per_pixel
+        return signal * photons
 
     def draw(self, truth: FloatArray, random: np.random.Generator | None) -> Windows:
         """Draw the counts of one experiment.
@@ -192,31 +194,24 @@ class Setting:
 
     def described(self) -> dict[str, Any]:
         """Say what was simulated, as plain values."""
-        at, optics, e = self.config.bounds, self.config.optics, self.experiment
+        at, optics, particle = self.config.bounds, self.config.optics, self.config.particle
         centre = (self.pixels - 1) / 2 * self.context.pixel_nm
+        sphere = {"diameter_nm": particle.nominal_diameter_nm} if particle.is_sphere else {}
+        collected = {"camera": self.experiment.on_camera, "collected": self.experiment.collected}
         return {
             "scheme": optics.scheme,
             "mode": self.mode,
-            "x_nm": float(self.truth[0] - centre),
-            "y_nm": float(self.truth[1] - centre),
-            "z_nm": float(self.truth[2]),
-            "mass_kda": float(self.truth[3]),
-            **(
-                {"diameter_nm": self.config.particle.nominal_diameter_nm}
-                if self.config.particle.is_sphere
-                else {}
-            ),
+            **dict(zip(PARAMETERS, (self.truth - [centre, centre, 0, 0]).tolist(), strict=True)),
+            **sphere,
             "focus_nm": optics.focus_nm,
             "attenuation": optics.attenuation if self.context.model.rho else 0.0,
             "na": optics.na,
             "pixel_size_nm": self.context.pixel_nm,
             "pixels": self.pixels,
-            "photons_per_pixel": at.photons_per_pixel,
-            "n_before": at.n_before,
-            "n_after": at.n_after,
+            **{name: getattr(at, name) for name in ("photons_per_pixel", "n_before", "n_after")},
             "read_noise_e": math.sqrt(self.read_variance_e2),
             "level_fitted": self.level,
-            "n_scattered": {"camera": e.on_camera, "collected": e.collected},
+            "n_scattered": collected,
         }
 
 

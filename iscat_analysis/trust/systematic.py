@@ -535,14 +535,15 @@ def assumed_error(key: str, config: Config, table: pd.DataFrame) -> Mapping[str,
         return {}
     mass = _masses(table)
     good = mass[(table["status"] == Status.OK.value).to_numpy()]
-    typical = float(np.median(good)) if good.size else None
-    here = _shift(key, config, table, sigma, typical)
+    standards = _Offset(key, sigma, there, response_of(there, table))
+    here = _Offset(key, sigma, config, response_of(config, table))
+    shift = here.shift(float(np.median(good)) if good.size else None)
     if not recorded:
-        share = max(abs(here), abs(here - _peak_shift(key, there, table, sigma)))
-    elif _value(key, config) == _value(key, there):
-        share = abs(here - _shift(key, there, table, sigma))
+        share = max(abs(shift), abs(shift - standards.peak_shift()))
+    elif here.value == standards.value:
+        share = abs(shift - standards.shift())
     else:
-        share = math.hypot(here, _shift(key, there, table, sigma))
+        share = math.hypot(shift, standards.shift())
     return {"mass_kda": share * mass}
 
 
@@ -556,100 +557,91 @@ def _of_spheres(
     mass = _masses(table)
     if config.optics.scheme == "darkfield" or not np.isfinite(mass).any():
         return {}
-    own = has_own_index(table)
-    share = np.zeros(mass.size)
+    own, share = has_own_index(table), np.zeros(mass.size)
+    offset = _Offset(key, sigma, config, response_of(config, table))
     for index in (False, True):
         rows = (own == index) & np.isfinite(mass)
         if rows.any() and not (index and key == "index"):
-            typical = float(np.median(mass[rows]))
-            share[rows] = abs(_shift(key, config, table, sigma, typical, index=index))
+            share[rows] = abs(offset.shift(float(np.median(mass[rows])), index=index))
     return {"mass_kda": share * mass}
 
 
 def _alike(here: Config, there: Config) -> bool:
     """Tell whether standards were measured like the particles, so that all shifts are equal."""
+    same: dict[str, Any] = {"file": None, "calibrate": "auto"}
     return (
-        here.optics.model_copy(update={"file": None, "calibrate": "auto"})
-        == there.optics.model_copy(update={"file": None, "calibrate": "auto"})
+        here.optics.model_copy(update=same) == there.optics.model_copy(update=same)
         and here.particle.nominal_height_nm == there.particle.nominal_height_nm
         and here.camera.pixel_size_nm == there.camera.pixel_size_nm
         and here.fit.mode == "mass"
     )
 
 
-def _value(key: str, config: Config) -> float | None:
-    values = {
-        "height_nm": config.particle.nominal_height_nm,
-        "magnification": config.camera.pixel_size_nm,
-    }
-    return values[key] if key in values else float(getattr(config.optics, key))
+@dataclass(frozen=True)
+class _Offset:
+    """One standard deviation by which an input of the model is off, and what estimates do."""
 
+    key: str
+    sigma: float
+    config: Config
+    respond: Response
 
-def _shift(
-    key: str,
-    config: Config,
-    table: pd.DataFrame,
-    sigma: float,
-    mass_kda: float | None = None,
-    *,
-    index: bool = False,
-) -> float:
-    """Relative shift of the amplitude for one standard deviation of an input.
+    @property
+    def value(self) -> float | None:
+        """The input as it is configured."""
+        if self.key == "height_nm":
+            return self.config.particle.nominal_height_nm
+        if self.key == "magnification":
+            return self.config.camera.pixel_size_nm
+        return float(getattr(self.config.optics, self.key))
 
-    Of a particle of a mass; without one, of a faint particle, as standards are.  The `index` of a
-    sphere may be free.
-    """
-    respond = response_of(config, table)
-    amplitude = respond.faint_amplitude
-    if mass_kda is not None:
-        scale = forward_model(config, respond.model.reach_nm).scale
-        amplitude = float(scale.amplitudes(mass_kda))
-    change = _change(key, config, respond, amplitude, sigma)
-    return respond.to_input(change, amplitude, index=index).amplitude
+    def shift(self, mass_kda: float | None = None, *, index: bool = False) -> float:
+        """Relative shift of the amplitude of a particle of a mass, or of a faint one as standards.
 
+        The `index` of a sphere may be free.
+        """
+        amplitude = self.respond.faint_amplitude
+        if mass_kda is not None:
+            scale = forward_model(self.config, self.respond.model.reach_nm).scale
+            amplitude = float(scale.amplitudes(mass_kda))
+        return self.respond.to_input(self._change(amplitude), amplitude, index=index).amplitude
 
-def _change(
-    key: str, config: Config, respond: Response, amplitude: float, sigma: float
-) -> FloatArray:
-    """Change of the picture for one standard deviation of an input, (ny, nx)."""
-    x, y, z, *_ = respond.theta(respond.model.height_nm, amplitude)
-    grid = respond.grid
+    def peak_shift(self) -> float:
+        """Relative error of the model's contrast per amplitude."""
 
-    def picture(sign: float) -> FloatArray:
-        step = sign * _STEP * sigma
-        if key == "height_nm":
-            return respond.model.amplitude_image(grid, x, y, z + step, amplitude)
-        if key == "magnification":
-            larger = PixelGrid(
-                grid.x_nm * (1 + step), grid.y_nm * (1 + step), grid.pixel_nm * (1 + step)
-            )
-            return respond.model.amplitude_image(larger, x, y, z, amplitude)
-        model = forward_model(_moved(key, config, step), respond.model.reach_nm)
-        return model.amplitude_image(grid, x, y, z, amplitude)
+        def peak(sign: float) -> float:
+            moved = _moved(self.key, self.config, sign * _STEP * self.sigma)
+            reach_nm = PEAK_SEARCH_RADIUS * moved.optics.wavelength_nm / moved.optics.na
+            return signed_peak(forward_model(moved, reach_nm))
 
-    return (picture(1.0) - picture(-1.0)) / (2 * _STEP)
+        shift, respond = 0.0, self.respond
+        if self.key != "magnification":
+            shift = (peak(1.0) - peak(-1.0)) / (2 * _STEP) / peak(0.0)
+        if respond.names:
+            faint, height = respond.faint_amplitude, respond.model.height_nm
+            optics = respond.to_input(self._change(faint), faint).optics
+            contrast, _, slopes = peak_gradient(respond.model, height, faint, respond.names)
+            shift -= float(slopes @ optics) / contrast
+        return shift
 
+    def _change(self, amplitude: float) -> FloatArray:
+        """Change of the picture, (ny, nx)."""
+        model, grid = self.respond.model, self.respond.grid
+        x, y, z, *_ = self.respond.theta(model.height_nm, amplitude)
 
-def _peak_shift(key: str, config: Config, table: pd.DataFrame, sigma: float) -> float:
-    """Relative error of the model's contrast per amplitude for one standard deviation."""
+        def picture(sign: float) -> FloatArray:
+            step = sign * _STEP * self.sigma
+            if self.key == "height_nm":
+                return model.amplitude_image(grid, x, y, z + step, amplitude)
+            if self.key == "magnification":
+                larger = PixelGrid(
+                    grid.x_nm * (1 + step), grid.y_nm * (1 + step), grid.pixel_nm * (1 + step)
+                )
+                return model.amplitude_image(larger, x, y, z, amplitude)
+            moved = forward_model(_moved(self.key, self.config, step), model.reach_nm)
+            return moved.amplitude_image(grid, x, y, z, amplitude)
 
-    def peak(sign: float) -> float:
-        moved = _moved(key, config, sign * _STEP * sigma)
-        reach_nm = PEAK_SEARCH_RADIUS * moved.optics.wavelength_nm / moved.optics.na
-        return signed_peak(forward_model(moved, reach_nm))
-
-    shift = 0.0
-    if key != "magnification":
-        shift = (peak(1.0) - peak(-1.0)) / (2 * _STEP) / peak(0.0)
-    respond = response_of(config, table)
-    if respond.names:
-        faint = respond.faint_amplitude
-        change = _change(key, config, respond, faint, sigma)
-        optics = respond.to_input(change, faint).optics
-        height = respond.model.height_nm
-        contrast, _, slopes = peak_gradient(respond.model, height, faint, respond.names)
-        shift -= float(slopes @ optics) / contrast
-    return shift
+        return (picture(1.0) - picture(-1.0)) / (2 * _STEP)
 
 
 def _moved(key: str, config: Config, step: float) -> Config:
