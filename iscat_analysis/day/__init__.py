@@ -18,7 +18,7 @@ import pandas as pd
 
 from iscat_analysis.answers.output import Notify, tell
 from iscat_analysis.calibration.line import with_line
-from iscat_analysis.config import configure
+from iscat_analysis.config import Config, configure
 from iscat_analysis.day.calibrate import Day, calibrate_day
 from iscat_analysis.day.compare import Reaction, kd_name, reaction_of
 from iscat_analysis.day.gather import Found, read_movie
@@ -27,6 +27,7 @@ from iscat_analysis.day.publish import publish_day
 from iscat_analysis.day.table import (
     Movie,
     Plan,
+    Standards,
     Table,
     configured,
     make_plan,
@@ -166,14 +167,9 @@ def batch(
         raise ConfigError(
             f"`only` = {only[0]}/{only[1]}: write it as K/N, as in 1/4 for the first of four parts"
         )
-    reaction = reaction_of(options["kd"], options["kd_masses_kda"])
-    standards, calibration = options["standards"], options["calibration"]
+    reaction, named, common = checked_options(options)
+    calibration = options["calibration"]
     table = samples if isinstance(samples, Table) else read_table(path_in("`samples`", samples))
-    try:
-        named = read_standards(standards) if standards is not None else ()
-    except ValueError as error:
-        raise ConfigError(f"`standards`: {error}") from None
-    common = configure(with_line(options["config"], calibration), settings=options["settings"])
     plan = make_plan(table, common, named)
     if calibration is not None and plan.standards:
         raise ConfigError(
@@ -222,6 +218,17 @@ def batch(
     movies, nothing = pd.DataFrame(rows, columns=["movie", "state", "why"]), pd.DataFrame()
     part = Batch(folder, movies, nothing, nothing, ran, tuple(failed))
     return part if only is not None else _gathered(part, plan, day, outcomes, reaction, runner)
+
+
+def checked_options(options: DayOptions) -> tuple[Reaction | None, Standards, Config]:
+    """Check options of a day: the reaction, the standards, and the configuration of all movies."""
+    reaction = reaction_of(options["kd"], options["kd_masses_kda"])
+    try:
+        named = read_standards(options["standards"] or ())
+    except ValueError as error:
+        raise ConfigError(f"`standards`: {error}") from None
+    config = with_line(options["config"], options["calibration"])
+    return reaction, named, configure(config, settings=options["settings"])
 
 
 def _bytes_of(address: Path) -> int:

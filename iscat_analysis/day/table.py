@@ -49,6 +49,7 @@ _LISTED_PROBLEMS = 5  # complaints in one line
 
 
 Records = list[tuple[str, dict[str, Any]]]
+Standards = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Row:
     replicate: str
     concentration_nm: float
     role: str
-    standards: tuple[tuple[float, float], ...] = ()
+    standards: Standards = ()
     settings: Mapping[str, Any] | tuple[str, ...] = ()
     further: Mapping[str, Any] = field(default_factory=dict)
 
@@ -172,7 +173,7 @@ def _is_there(address: Path) -> bool:
     return is_file(path) or (is_folder(path) and is_movie_folder(path))
 
 
-def read_standards(text: str | Sequence[float]) -> tuple[tuple[float, float], ...]:
+def read_standards(text: str | Sequence[float]) -> Standards:
     """Read the masses of standards."""
     if not isinstance(text, (str, list, tuple)):
         raise ValueError(f"{text!r} is no list of masses; write it as 66,146,480")
@@ -309,7 +310,7 @@ def _row(
                 f"concentration_nm: {known['concentration_nm']!r} is not a concentration in "
                 "nmol/l; write a number with a decimal point, or leave it empty"
             )
-    standards: tuple[tuple[float, float], ...] = ()
+    standards: Standards = ()
     try:
         masses = known["standards"]
         standards = read_standards([masses] if isinstance(masses, (int, float)) else masses)
@@ -368,12 +369,10 @@ class Plan:
     flats: tuple[Movie, ...]
     calibrants: tuple[Movie, ...]
     movies: tuple[Movie, ...]
-    standards: tuple[tuple[float, float], ...]
+    standards: Standards
 
 
-def make_plan(
-    table: Table, config: Config, standards: tuple[tuple[float, float], ...] = ()
-) -> Plan:
+def make_plan(table: Table, config: Config, standards: Standards = ()) -> Plan:
     """Plan a batch."""
     for row in table.rows:
         try:

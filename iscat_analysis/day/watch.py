@@ -28,11 +28,10 @@ import pandas as pd
 
 from iscat_analysis.answers.output import Notify, tell
 from iscat_analysis.calibration.line import mass_line
-from iscat_analysis.config import Config, configure
-from iscat_analysis.day import Batch, batch
-from iscat_analysis.day.compare import reaction_of
+from iscat_analysis.config import Config
+from iscat_analysis.day import Batch, batch, checked_options
 from iscat_analysis.day.jobs import Records, claim_folder
-from iscat_analysis.day.table import TABLES, Table, read_growing, read_standards
+from iscat_analysis.day.table import TABLES, Table, read_growing
 from iscat_analysis.errors import ConfigError, DataError, IscatError, SchedulerError
 from iscat_analysis.fitting.run import is_resumable
 from iscat_analysis.hashing import states_of
@@ -112,18 +111,15 @@ class _Growing:
 
     def __init__(self, path: Path, config: Config, notify: Notify | None) -> None:
         self._path, self._config, self._say = path, config, _Once(notify)
-        self._state: State | None = None
-        self._looks, self._analysed = 0, 0
+        self._files, self._analysed = _MovieFiles(path), 0
 
     def rests(self) -> bool:
         """Look at the files, and tell whether they have not changed for some looks."""
-        found = _state(self._path)
-        if found is None:
+        self._files.look()
+        if self._files.state is None:
             self._say(f"{self._path}: cannot be read; waiting for it")
             return False
-        self._looks = self._looks + 1 if found == self._state else 0
-        self._state = found
-        if self._looks < RESTS:
+        if self._files.checks < RESTS:
             return False
         if written := is_open_to_write(self._path):
             self._say(
@@ -234,15 +230,11 @@ def watch(
     results = watched / FOLDER if out is None else path_in("`out`", out)
     if results.resolve() == watched.resolve():
         raise ConfigError(f"{results}: is where the movies are; choose another `out`")
-    standards, calibration = options["standards"], options["calibration"]
-    try:
-        read_standards(standards or ())
-    except ValueError as error:
-        raise ConfigError(f"`standards`: {error}") from None
-    reaction_of(options["kd"], options["kd_masses_kda"])
+    _, _, common = checked_options(options)
+    calibration = options["calibration"]
     resolved: DayOptions = {
         **options,
-        "config": configure(options["config"], settings=options["settings"]),
+        "config": common,
         "settings": None,
         "calibration": None if calibration is None else mass_line(calibration),
     }
@@ -256,7 +248,7 @@ def watch(
         notify=notify,
         command=command or f"iscat_analysis.watch({str(folder)!r})",
     )
-    run, seen = _Run(analyse, standards, say), WatchedFolder(watched, results, say)
+    run, seen = _Run(analyse, options["standards"], say), WatchedFolder(watched, results, say)
     ended = stop or threading.Event()
     done: Ready | None = None
     try:
@@ -291,9 +283,18 @@ def _of_one_movie(progress: Progress) -> Progress:
 class _MovieFiles:
     """Files of a movie when last checked, the number of equal checks, and if it is readable."""
 
-    state: State | None
+    address: Path
+    state: State | None = ()
     checks: int = 0
     readable: bool = False
+
+    def look(self) -> bool:
+        """Check them again; tell whether they changed, and were there before and are now."""
+        before, self.state = self.state, _state(self.address)
+        changed = self.state != before
+        self.checks = 0 if changed else self.checks + 1
+        self.readable &= not changed
+        return changed and bool(before and self.state)
 
     @property
     def settled(self) -> bool:
@@ -343,17 +344,12 @@ class WatchedFolder:
         return replace(table, rows=ready, absent=()), states
 
     def _files_of(self, path: Path, *, table: bool = False) -> _MovieFiles:
-        state = _state(path)
-        before = self._files.get(path)
-        if before is not None and before.state == state:
-            before.checks += 1
-        else:
-            if before is not None and before.state is not None and state is not None and not table:
-                self._say(f"{path.name}: is being written, and waited for")
-            self._files[path] = before = _MovieFiles(state)
-        if before.checks == 1 and state is not None and not table:
-            before.readable = _opens(path)
-        return before
+        found = self._files.setdefault(path, _MovieFiles(path))
+        if found.look() and not table:
+            self._say(f"{path.name}: is being written, and waited for")
+        if found.checks == 1 and found.state is not None and not table:
+            found.readable = _opens(path)
+        return found
 
 
 def _state(address: Path) -> State | None:
