@@ -347,7 +347,10 @@ def _interval(
     """
     at, found, problem = equilibrium.at, maxima[0], equilibrium.problem()
     best, least, most = float(found.theta[at]), float(problem.low[at]), float(problem.high[at])
-    branches = [{float(one.theta[at]): one} for one in maxima]
+    branches: list[dict[float, Maximum]] = []
+    for one in maxima:
+        if all(abs(one.value - other.value) > _SAME for b in branches for other in b.values()):
+            branches.append({float(one.theta[at]): one})
 
     @cache
     def deviance(ln_kd: float) -> float:

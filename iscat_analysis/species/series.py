@@ -34,7 +34,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit, log_ndtr, ndtr
+from scipy.special import expit, log_ndtr, ndtr, softmax
 
 from iscat_analysis._kernels.mixture import mixture_score
 from iscat_analysis.records import FloatArray
@@ -265,43 +265,33 @@ class Series:
         variance = np.exp(2 * theta[place + 1 : self.tail]) - self.noise
         return Shared(mean, variance, float(theta[self.tail]), limit)
 
-    def _of_tables(self, theta: FloatArray) -> FloatArray:
-        """Parameters of each table: those of all, its share of background, its logits.
-
-        Shapes: `theta` (p,), result (tables, shares + k).
-        """
-        common = np.tile(theta[: self.shares], (self.number, 1))
-        share = theta[self.shares : self.own, None]
-        return np.hstack([common, share, theta[self.own :].reshape(self.number, self.kinds - 1)])
-
-    def _parts(self, x: NDArray[Any]) -> NDArray[Any]:
-        """Give ln w, μ and τ² of the parts of all species and of the background.
+    def _parts(self, common: NDArray[Any]) -> NDArray[Any]:
+        """Give ln of the share, μ and τ² of the parts of every species and of the background.
 
         Complex parameters give the slopes with the values (complex steps: Squire & Trapp, SIAM
         Rev. 40, 110, 1998).
 
-        Shapes: `x` (…, shares + k), result (…, 3, parts).
+        Shapes: `common` (…, shares), what tables share, result (…, 3, parts).
         """
-        place, front = self.parts, (*x.shape[:-1], -1)
-        mean = x[..., :place] @ self.composition.T + x[..., place, None]
-        width = np.exp(x[..., place + 1 : self.tail])
-        reach = (x[..., self.tail, None] * width)[..., None]
-        means = mean[..., None] + reach * MEANS
-        variances = (width**2)[..., None] - self.noise + reach**2 * VARIANCES
-        nothing = np.zeros_like(x[..., :1])  # the logits of the first knot and the first species
-        shape = np.exp(
-            np.concatenate([nothing, x[..., self.tail + 1 : self.tail + self.knots.size]], axis=-1)
-        )
+        place, tail = self.parts, common[..., self.tail, None]
+        mean = common[..., :place] @ self.composition.T + common[..., place, None]
+        width = np.exp(common[..., place + 1 : self.tail])
+        reach = (tail * width)[..., None]
+        means, variances = mean[..., None] + reach * MEANS, reach**2 * VARIANCES
+        variances = variances + (width**2)[..., None] - self.noise
+        nothing = np.zeros_like(tail)
+        bends = common[..., self.tail + 1 : self.tail + self.knots.size]
+        shape = np.exp(np.concatenate([nothing, bends], axis=-1))
         back = (shape @ self.back_share.T) / shape.sum(axis=-1, keepdims=True)
-        share, logits = np.split(x[..., self.shares :], [1], axis=-1)
-        logits = np.concatenate([nothing, logits], axis=-1)
-        species = logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True))
-        beside = np.log1p(np.exp(share))
-        weights = (species - beside)[..., None] + np.log(SHARES)
-        own = np.stack([part.reshape(front) for part in (weights, means, variances)], axis=-2)
         level = np.broadcast_to(nothing, back.shape)
-        behind = [np.log(back) + share - beside, self.back_mean + level, self.back_variance + level]
-        return np.concatenate([own, np.stack(behind, axis=-2)], axis=-1)
+        columns = (
+            (np.log(SHARES) + 0 * reach, np.log(back)),
+            (means, self.back_mean + level),
+            (variances, self.back_variance + level),
+        )
+        front = (*common.shape[:-1], -1)
+        rows = [np.concatenate([own.reshape(front), rest], axis=-1) for own, rest in columns]
+        return np.stack(rows, axis=-2)
 
     def modes(self, theta: FloatArray) -> FloatArray:
         """Give the masses at which the peaks are highest, for the median noise of events.
@@ -311,7 +301,7 @@ class Series:
         Shapes: result (k,).
         """
         size = self.kinds * SHARES.size
-        parts = self._parts(self._of_tables(theta)[0])[1:, :size].reshape(2, self.kinds, -1)
+        parts = self._parts(theta[: self.shares])[1:, :size].reshape(2, self.kinds, -1)
         return np.array([top_of(SHARES, m, v + self.noise) for m, v in zip(*parts, strict=True)])
 
     def detected(self, theta: FloatArray) -> FloatArray:
@@ -344,11 +334,13 @@ class Series:
 
         Shapes: `theta` (p,), results (tables,), (tables, shares + k).
         """
-        x = self._of_tables(theta)
-        steps = x[:, None] + 1j * _COMPLEX_STEP * np.eye(x.shape[1])
+        common, logits, share = theta[: self.shares], self.logits(theta), self.background(theta)
+        steps = common + 1j * _COMPLEX_STEP * np.eye(common.size)
         rises = self._parts(steps).imag / _COMPLEX_STEP
-        weight, means, variances = np.swapaxes(self._parts(x), 0, 1)
-        weight, mean, variance = np.exp(weight), means[0], variances[0]
+        log_part, mean, variance = self._parts(common)
+        kinds, first = softmax(logits, axis=1), SHARES.size * np.arange(self.kinds + 1)
+        of_kind = np.hstack([kinds * (1 - share)[:, None], share[:, None]])
+        weight = np.repeat(of_kind, np.diff(first, append=mean.size), axis=1) * np.exp(log_part)
         values = np.zeros(self.number)
         by_part = np.zeros((self.number, 3, mean.size))
         for number, table in enumerate(self.tables):
@@ -373,7 +365,15 @@ class Series:
         values -= size * np.log(norm)
         over = (size / norm)[:, None]
         by_part -= (over * weight)[:, None] * np.stack([chance, seen @ rise, seen @ bend], axis=1)
-        slopes = np.einsum("tcq,tpcq->tp", by_part, rises)
+        by_kind = np.add.reduceat(by_part[:, 0], first, axis=1)
+        of_species, of_back = by_kind[:, :-1].sum(axis=1), by_kind[:, -1]
+        slopes = np.hstack(
+            [
+                np.einsum("tcq,pcq->tp", by_part, rises),
+                (of_back * (1 - share) - of_species * share)[:, None],
+                (by_kind[:, :-1] - of_species[:, None] * kinds)[:, 1:],
+            ]
+        )
         if self.learned:
             bell = self.steps * np.exp(-0.5 * at_nodes**2) / math.sqrt(2 * math.pi)
             by_node = over * (weight @ density.T) * bell

@@ -315,5 +315,4 @@ def height_weights(
 
 def lagrange(nodes: FloatArray, points: FloatArray) -> FloatArray:
     """Weights of the polynomial through values at the nodes, shape (points, nodes)."""
-    through = scipy.interpolate.BarycentricInterpolator(nodes, np.eye(nodes.size))
-    return np.asarray(through(points))
+    return np.asarray(scipy.interpolate.KroghInterpolator(nodes, np.eye(nodes.size))(points))
