@@ -315,13 +315,10 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
         findings.append(NO_MASS({"amount": count(missing, "event"), "advice": advice, **limits}))
     rows = good[known]
     window = rows["n_after"].max() if "n_after" in rows else 0
-    return EventTable(
-        name,
-        *(values[known] for values in (mass, sigma, frame, x, y)),
-        window_frames=int(np.nan_to_num(window)) or None,
-        scale_error=shared_error(rows),
-        findings=tuple(findings),
-    )
+    window_frames, told = int(np.nan_to_num(window)) or None, tuple(findings)
+    mass, sigma, frame, x, y = (values[known] for values in (mass, sigma, frame, x, y))
+    found = EventTable(name, mass, sigma, frame, x, y, scale_error=shared_error(rows))
+    return replace(found, window_frames=window_frames, findings=told)
 
 
 def _cut(found: EventTable, above_kda: float) -> EventTable:

@@ -43,12 +43,8 @@ def test_the_likelihood_is_that_of_scipy_and_so_is_its_slope() -> None:
         w, m, v = np.exp(theta[:2]), theta[2:4], theta[4:]
         return float(mixture_score(x, sigma**2, w, m, v)[0])
 
-    expected = np.log(
-        sum(
-            w * norm.pdf(x, m, np.sqrt(v + sigma**2))
-            for w, m, v in zip(weight, mean, variance, strict=True)
-        )
-    ).sum()
+    densities = norm.pdf(x[:, None], mean, np.sqrt(variance + sigma[:, None] ** 2))
+    expected = np.log(densities @ weight).sum()
     found, gradient = mixture_score(x, sigma**2, weight, mean, variance)
     assert found == pytest.approx(expected, rel=1e-12)
     theta = np.concatenate([np.log(weight), mean, variance])
@@ -71,12 +67,9 @@ def test_what_detection_takes_off_is_that_of_scipy_and_so_is_its_slope(same_nois
         return value, slopes.ravel()
 
     noise = np.maximum(sigma, efficiency.sigma_kda)
-    expected = np.log(
-        sum(
-            math.exp(w) * norm.sf(efficiency.threshold_kda, m, np.sqrt(v + noise**2))
-            for w, m, v in zip(theta[:2], theta[2:4], theta[4:], strict=True)
-        )
-    ).sum()
+    spread = np.sqrt(theta[4:] + noise[:, None] ** 2)
+    seen = norm.sf(efficiency.threshold_kda, theta[2:4], spread) @ np.exp(theta[:2])
+    expected = np.log(seen).sum()
     value, slope = found(theta)
     assert value == pytest.approx(expected, rel=1e-10)
     numerical = approx_fprime(theta, lambda theta: found(theta)[0], 1e-6)
@@ -142,20 +135,18 @@ def test_the_table_of_species() -> None:
         found.species["count"].tolist()
     )
     assert found.species["leaving"].tolist() == pytest.approx([25, 25], abs=1)
-    for name in ("mass", "width", "fraction"):
-        value = found.species["mass_kda" if name == "mass" else f"{name}_kda"
-                              if name == "width" else name]  # fmt: skip
-        assert (found.species[f"{name}_low"] <= value + 1e-6).all()
-        assert (found.species[f"{name}_high"] >= value - 1e-6).all()
+    for name, of in (("mass", "mass_kda"), ("width", "width_kda"), ("fraction", "fraction")):
+        assert (found.species[f"{name}_low"] <= found.species[of] + 1e-6).all()
+        assert (found.species[f"{name}_high"] >= found.species[of] - 1e-6).all()
     assert found.selection["delta_bic"].min() == 0
     assert found.support > 0.8
 
 
 def test_the_same_seed_gives_the_same_numbers() -> None:
     mass, sigma = sample()
-    first = describe(mass, sigma, seed=3, draws=10).to_dict()
-    again = describe(mass, sigma, seed=3, draws=10).to_dict()
-    other = describe(mass, sigma, seed=4, draws=10).to_dict()
+    first, again, other = (
+        describe(mass, sigma, seed=seed, draws=10).to_dict() for seed in (3, 3, 4)
+    )
     assert json.dumps(first) == json.dumps(again)
     assert first["species"][0]["mass_se"] != other["species"][0]["mass_se"]
 

@@ -100,19 +100,15 @@ def test_speckle_has_its_contrast(contrast: float) -> None:
     assert not np.array_equal(background, Movie(_config(simulation), 2).background_e)
 
 
-def test_laser_power() -> None:
+def test_laser_power_multiplies_the_light() -> None:
     simulation = {"power_noise": 0.03, "frames": 2000, "events": [], "shape": [8, 8]}
-    power = Movie(_config(simulation), 4).power
+    movie = Movie(_config(simulation), 4)
+    power, frames = movie.power, movie.expected_frames()
     assert kstest((power - 1) / 0.03, norm.cdf).pvalue > 1e-4
     assert abs(np.corrcoef(power[1:], power[:-1])[0, 1]) < SIGMAS / np.sqrt(2000)
-    steady = Movie(_config(simulation | {"power_noise": 0.0}), 4).power
-    np.testing.assert_array_equal(steady, 1.0)
-
-
-def test_power_multiplies_the_light() -> None:
-    movie = Movie(_config({"power_noise": 0.05}), 4)
-    frames = list(movie.expected_frames())
-    np.testing.assert_allclose(frames[3] / movie.power[3], frames[0] / movie.power[0], rtol=1e-12)
+    first, second = next(frames), next(frames)
+    np.testing.assert_allclose(second / power[1], first / power[0], rtol=1e-12)
+    np.testing.assert_array_equal(Movie(_config(simulation | {"power_noise": 0.0}), 4).power, 1.0)
 
 
 def test_the_background_may_be_an_image(tmp_path: Path) -> None:
@@ -234,11 +230,6 @@ def test_a_measured_background_goes_on_as_its_reflection(tmp_path: Path) -> None
     np.testing.assert_allclose(last[:, :5], still[:, 4::-1], rtol=1e-9)
 
 
-def test_a_sample_that_drifts_out_of_sight_is_refused() -> None:
-    with pytest.raises(ConfigError, match="out of a field of"):
-        Movie(_config({"drift_px_per_frame": [5.0, 0.0], "frames": 100}), 1)
-
-
 def test_dark_field_counts_the_collected_photons() -> None:
     """All the light of a particle, on a field wide enough, is what was asked for."""
     event = EVENT | {"x_px": 100.0, "y_px": 99.4}
@@ -283,10 +274,16 @@ def test_random_particles() -> None:
 # ---- files -----------------------------------------------------------------------------------
 
 
-def test_truth_lies_beside_the_movie(tmp_path: Path) -> None:
+def test_the_movie_says_its_units_and_truth_lies_beside_it(tmp_path: Path) -> None:
     events = [EVENT, EVENT | {"leave": 9, "mass_kda": 300.0, "x_px": 3.25}]
-    config = _config({"events": events})
+    config = _config({"events": events}, camera={"frame_rate_hz": 250.0})
     returned = write_stack(config, tmp_path / "movie.tif")
+    with tifffile.TiffFile(tmp_path / "movie.tif") as file:
+        assert file.is_ome
+        assert file.series[0].shape == (12, *SHAPE)
+        assert file.series[0].dtype == np.uint16
+        assert 'PhysicalSizeX="0.0844"' in file.ome_metadata
+        assert 'TimeIncrement="0.004"' in file.ome_metadata
     truth = pd.read_csv(tmp_path / "movie.truth.csv")
     assert tuple(truth.columns) == TRUTH_COLUMNS
     assert len(returned) == 2
@@ -295,17 +292,6 @@ def test_truth_lies_beside_the_movie(tmp_path: Path) -> None:
     assert truth["leave"].isna().tolist() == [True, False]
     # One calibrated contrast: gradient times mass.
     np.testing.assert_allclose(truth["contrast"], -3.1e-5 * truth["mass_kda"], rtol=1e-6)
-
-
-def test_the_movie_says_its_units(tmp_path: Path) -> None:
-    config = _config(camera={"frame_rate_hz": 250.0})
-    write_stack(config, tmp_path / "movie.tif")
-    with tifffile.TiffFile(tmp_path / "movie.tif") as file:
-        assert file.is_ome
-        assert file.series[0].shape == (12, *SHAPE)
-        assert file.series[0].dtype == np.uint16
-        assert 'PhysicalSizeX="0.0844"' in file.ome_metadata
-        assert 'TimeIncrement="0.004"' in file.ome_metadata
 
 
 def test_nothing_is_overwritten_or_left_half_done(tmp_path: Path) -> None:
@@ -327,7 +313,9 @@ def test_nothing_is_overwritten_or_left_half_done(tmp_path: Path) -> None:
     assert {p.name for p in tmp_path.iterdir()} == {"movie.tif", "movie.truth.csv"}
 
 
-def test_counts_beyond_16_bits_are_refused() -> None:
+def test_counts_beyond_16_bits_and_drifts_out_of_sight_are_refused() -> None:
     with pytest.raises(ConfigError, match="16 bits"):
         Movie(_config({"photons_per_pixel": 7e4}, camera={"gain_e_per_adu": 1.0}), 1)
     Movie(_config({"photons_per_pixel": 7e4}, camera={"gain_e_per_adu": 2.0}), 1)
+    with pytest.raises(ConfigError, match="out of a field of"):
+        Movie(_config({"drift_px_per_frame": [5.0, 0.0], "frames": 100}), 1)

@@ -297,15 +297,11 @@ def test_the_noise_is_named(found: EmpiricalSpread, pixels: float, word: str) ->
     assert said.kind is SCALED_SIGMA
 
 
-def test_slow_noise_of_a_rejected_model_may_be_its_rings() -> None:
-    slow = _achieved(1.80, 1.0, (1.03, 1.0, 1.02, 1.14, 1.80))
-    assert "wrong model" in likely_noise(slow, {}, rejected=True)
-    white = _achieved(1.22, 1.22, (1.22,) * 5)
-    assert "wrong model" not in likely_noise(white, {}, rejected=True)
-
-
-def test_what_helps_against_a_drift_depends_on_what_frames_stand_against() -> None:
+def test_what_slow_noise_may_be_and_what_helps_depend_on_the_model_and_on_the_frames() -> None:
     drifting = _achieved(1.80, 1.0, (1.03, 1.0, 1.02, 1.14, 1.80))
+    white = _achieved(1.22, 1.22, (1.22,) * 5)
+    assert "wrong model" in likely_noise(drifting, {}, rejected=True)  # it may be its rings
+    assert "wrong model" not in likely_noise(white, {}, rejected=True)
     assert "drift_correction" in likely_noise(drifting, {}, sliding=True)
     fixed = likely_noise(drifting, {}, sliding=False)
     assert "drift_correction" not in fixed
