@@ -260,9 +260,9 @@ class Runner:
             state: State = "failed" if why else "done"
             hashes = kept.get("inputs", {})
             results = {} if why else results_in(result.parent)
-            inputs = {each: {**found, **hashes.get(each, {})} for each, found in before.items()}
+            known = {each: {**found, **hashes.get(each, {})} for each, found in before.items()}
             record = {**kept, "key": key, "state": state, "why": why}
-            record |= {"results": results, "inputs": inputs}
+            record |= {"results": results, "inputs": known}
             self.records.write(name, record)
             return Outcome(state, why, ran=True, record=record)
 

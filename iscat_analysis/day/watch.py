@@ -62,7 +62,7 @@ def watch_movie(
     out: Path,
     interval_s: float = 10.0,
     progress: Progress = silent,
-    notify: Notify | None = None,
+    notify: Notify = lambda _: None,
     command: str = "",
 ) -> Analysis:
     """Analyse a movie while it is being recorded, and all of it once the file rests."""

@@ -349,9 +349,10 @@ def _ladder(
     drawn = [np.array(choice.values(found, r.mixture)) for r in repeats]
     scale = np.append(scale_error(values[:1]), 0.0)
     low, high = widened(interval_of(drawn, 2), values, scale)
-    monomer, offset = np.column_stack([values, _error(drawn, 2), low, high]).tolist()
-    numbers: list[float] = [*monomer, *offset]
-    return LadderFit(found.steps, *numbers, held=choice.held, p_value=found.p_value)
+    columns = np.column_stack([values, _error(drawn, 2), low, high]).ravel().tolist()
+    names = [f"{of}_{end}" for of in ("monomer", "offset") for end in ("kda", "se", "low", "high")]
+    numbers = dict(zip(names, columns, strict=True))
+    return LadderFit(steps=found.steps, held=choice.held, p_value=found.p_value, **numbers)
 
 
 def _doubt(ladder: LadderFit | None) -> Finding | None:

@@ -204,7 +204,7 @@ def _curve(events: Events, best: Mixture) -> pd.DataFrame:
     """Give the density per nm that the populations and the errors make."""
     reach = _MARGIN * float(np.median(events.sigma))
     ends = np.exp([events.x.min() - reach, events.x.max() + reach])
-    diameter = np.linspace(*ends, _POINTS)
+    diameter = np.linspace(ends[0], ends[1], _POINTS)
     density = events.x.size * mean_density(events, best, np.log(diameter)) / diameter
     return pd.DataFrame({"diameter_nm": UNIT_NM * diameter, "model": density / UNIT_NM})
 

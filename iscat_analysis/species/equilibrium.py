@@ -252,7 +252,7 @@ class _Equilibrium:
         return np.concatenate([theta[: self.at], self._logits(theta[self.at :])])
 
     def _logits(self, constants: FloatArray) -> FloatArray:
-        values = {"power": self.power, "inactive": 0.0}
+        values = {"power": self.power or 0.0, "inactive": 0.0}
         values |= dict(zip(self.names, constants.tolist(), strict=True))
         found = landing_logits(
             self.model, self.totals, math.exp(values["ln_kd"]), values["inactive"],

@@ -96,6 +96,9 @@ class Structure:
         return np.asarray(slopes.ravel() @ self.design.reshape(slopes.size, -1))
 
 
+Samples = Sequence[tuple[Events, Structure]]
+
+
 def score(events: Events, mixture: Mixture) -> tuple[float, FloatArray]:
     """Log-likelihood of the events seen, and its slope.
 
@@ -115,9 +118,7 @@ def score(events: Events, mixture: Mixture) -> tuple[float, FloatArray]:
     return value - seen + events.log_seen, slopes - missed
 
 
-def log_likelihood(
-    samples: Sequence[tuple[Events, Structure]], theta: FloatArray
-) -> tuple[float, FloatArray]:
+def log_likelihood(samples: Samples, theta: FloatArray) -> tuple[float, FloatArray]:
     """Log-likelihood of several samples with the prior, and its slope.
 
     Shapes: `theta` (p,), `slope` (p,).
@@ -133,9 +134,7 @@ def log_likelihood(
     return total, slope
 
 
-def parameters(
-    samples: Sequence[tuple[Events, Structure]], mixtures: Sequence[Mixture]
-) -> FloatArray:
+def parameters(samples: Samples, mixtures: Sequence[Mixture]) -> FloatArray:
     """Parameters of mixtures that these structures made, or nearly so, by least squares.
 
     Of what it shares, each sample counts as its number of events.
@@ -153,16 +152,14 @@ def parameters(
     return np.asarray(np.linalg.lstsq(np.vstack(rows), np.concatenate(values), rcond=None)[0])
 
 
-def joint_problem(samples: Sequence[tuple[Events, Structure]]) -> Problem:
+def joint_problem(samples: Samples) -> Problem:
     """Make the problem of maximising the likelihood of all samples."""
     first, size = samples[0][1], sum(events.x.size for events, _ in samples)
     return Problem(partial(log_likelihood, samples), first.low, first.high, first.scale, size)
 
 
 def maximise_jointly(
-    samples: Sequence[tuple[Events, Structure]],
-    start: Sequence[Mixture],
-    near: FloatArray | None = None,
+    samples: Samples, start: Sequence[Mixture], near: FloatArray | None = None
 ) -> Maximum:
     """Maximise the likelihood of the events of all samples; `near` as for `maximise`.
 

@@ -44,7 +44,7 @@ from iscat_analysis.options import EventOptions, only, takes
 from iscat_analysis.reading import read_json
 from iscat_analysis.records import FloatArray, species_rows
 from iscat_analysis.species.events import POSSIBLE_KDA, Efficiency, Events, possible
-from iscat_analysis.units import count
+from iscat_analysis.units import count, listed
 
 UNKNOWN_SIGMA_KDA = 1.0
 """Error of an event whose table has none [kDa]."""
@@ -81,11 +81,10 @@ def sentences(findings: Iterable[Finding]) -> list[str]:
     for sentence, about in tables.items():
         if len(about) == 1:
             ((name, amount),) = about
-            found.append(f"{name}: {amount} {sentence}" if amount else f"{name}: {sentence}")
+            found.append(" ".join(filter(None, (f"{name}:", amount, sentence))))
             continue
         named = [f"{name} ({amount})" if amount else name for name, amount in about]
-        more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
-        found.append(f"{', '.join(named[:_NAMED])}{more}: {sentence}")
+        found.append(f"{listed(named, _NAMED)}: {sentence}")
     return found
 
 

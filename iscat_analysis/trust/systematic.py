@@ -66,9 +66,10 @@ _SAME = 1e-6  # change of the scale, which rounding leaves between equal optics
 # What rounding leaves of a place, mass or contrast that the optics do not change [nm, kDa, and 1]
 _NOTHING = {"x_nm": 1e-4, "y_nm": 1e-4, "z_nm": 1e-4, "mass_kda": 1e-9, "contrast": 1e-9}
 
-Errors = Callable[[Config, pd.DataFrame], Mapping[str, FloatArray]]
-"""Gives, by name in `COMMON`, the standard deviation for every event; none for what it does not
-move."""
+Sigmas = Mapping[str, FloatArray]
+"""Standard deviations for every event, by name in `COMMON`; none of what a source does not move."""
+
+Errors = Callable[[Config, pd.DataFrame], Sigmas]
 
 Kind = Literal["measured", "learned", "assumed"]
 
@@ -86,7 +87,7 @@ class Source:
     """Whether it can make anything wrong; else it is named in the budget alone."""
 
 
-Contribution = tuple[Source, Mapping[str, FloatArray]]
+Contribution = tuple[Source, Sigmas]
 """A source with what it makes of every event, by name in `COMMON`."""
 
 
@@ -174,9 +175,7 @@ _HELD = {
 """What shrinks the errors by heights or extensions that were held, although particles differ."""
 
 
-def _as_given(
-    shift_kda: FloatArray, config: Config, table: pd.DataFrame
-) -> Mapping[str, FloatArray]:
+def _as_given(shift_kda: FloatArray, config: Config, table: pd.DataFrame) -> Sigmas:
     """Give errors of masses that are known already.
 
     Shapes: `shift_kda` (rows,).
@@ -187,7 +186,7 @@ def _as_given(
 
 def _masses(table: pd.DataFrame) -> FloatArray:
     """Magnitudes of the masses [kDa], shape (rows,)."""
-    return np.abs(table["mass_kda"].to_numpy(float))
+    return np.asarray(np.abs(table["mass_kda"].to_numpy(float)))
 
 
 def _predicts_pictures(config: Config) -> bool:
@@ -226,7 +225,7 @@ def _of_the_camera(config: Config, camera: Mapping[str, Any]) -> Iterator[Source
                      "nothing: it changes sigma, and no mass", moves=False)  # fmt: skip
 
 
-def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
+def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Sigmas:
     """Give what contrasts that are all wrong by a share do to them and to masses.
 
     Masses of dipoles are wrong by that share too.  The contrast of a sphere is not in proportion to
@@ -246,9 +245,7 @@ def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Mapping[st
     return {"mass_kda": out, **result}
 
 
-def _of_the_selection(
-    threshold_snr: float, config: Config, table: pd.DataFrame
-) -> Mapping[str, FloatArray]:
+def _of_the_selection(threshold_snr: float, config: Config, table: pd.DataFrame) -> Sigmas:
     """Give by how much masses of those that pass a threshold are too large on average.
 
     Of a Gaussian of which what is u standard deviations below its middle is cut off, the mean is
@@ -263,9 +260,7 @@ def _of_the_selection(
     return {"mass_kda": shift * sigma} if np.any(shift > 0) else {}
 
 
-def _of_the_missing_record(
-    scale: MassScale, config: Config, table: pd.DataFrame
-) -> Mapping[str, FloatArray]:
+def _of_the_missing_record(scale: MassScale, config: Config, table: pd.DataFrame) -> Sigmas:
     """Give what the carried scale is wrong by, if the standards had the optics of the movie."""
     line, share = config.calibration, abs(scale.carried - 1)
     if line is None or not line.optics_assumed or share < _SAME or not _fits_masses(config):
@@ -303,17 +298,13 @@ def misfit_error(table: pd.DataFrame, pixels: int) -> float:
     return MASS_SHARE * share if share > REJECTED_SHARE else 0.0
 
 
-def _of_what_is_left_over(
-    mass_share: float, config: Config, table: pd.DataFrame
-) -> Mapping[str, FloatArray]:
+def _of_what_is_left_over(mass_share: float, config: Config, table: pd.DataFrame) -> Sigmas:
     """Give what masses are wrong by where the optics were rejected, and no others learned."""
     del config
     return {"mass_kda": mass_share * table["mass_kda"].to_numpy(float)} if mass_share else {}
 
 
-def _of_heavy_particles(
-    scale: MassScale, config: Config, table: pd.DataFrame
-) -> Mapping[str, FloatArray]:
+def _of_heavy_particles(scale: MassScale, config: Config, table: pd.DataFrame) -> Sigmas:
     """Give the error of heavy particles by a line of faint standards.
 
     It shifts all masses to one side, and is given if all rows together would show it.
@@ -347,7 +338,7 @@ def _off_the_line(scale: MassScale, table: pd.DataFrame) -> tuple[FloatArray, Fl
     return np.abs(mass * scale.bend(mass)), np.where(good, sigma, np.nan)
 
 
-def _of_the_reference(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
+def _of_the_reference(config: Config, table: pd.DataFrame) -> Sigmas:
     """Give what masses are wrong by where those of the same particles differ over the field."""
     found = reference_map(config, table)
     if found is None:
@@ -356,7 +347,7 @@ def _of_the_reference(config: Config, table: pd.DataFrame) -> Mapping[str, Float
     return {"mass_kda": np.abs(mass * found.share(x, y))}
 
 
-def _of_the_line(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
+def _of_the_line(config: Config, table: pd.DataFrame) -> Sigmas:
     """Give what the line between contrast and mass may be wrong by."""
     line = config.calibration
     if line is None or not (line.gradient_se_per_kda or line.offset_se):
@@ -367,7 +358,7 @@ def _of_the_line(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray
     return {"mass_kda": line_sigma_kda(mass, line.gradient_per_kda, covariance)}
 
 
-def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
+def _of_the_optics(config: Config, table: pd.DataFrame) -> Sigmas:
     """Give what the measured optics may be wrong by: D Σ Dᵀ of `bounds.shared`."""
     errors, pixel = config.optics.covariance, config.camera.pixel_size_nm
     if errors is None or not errors.names or pixel is None or not _predicts_pictures(config):
@@ -385,9 +376,7 @@ def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArr
     return {name: sigma[:, k] for k, name in enumerate(COMMON) if name in reported}
 
 
-def _of_configured_optics(
-    tested: Mapping[str, Any], config: Config, table: pd.DataFrame
-) -> Mapping[str, FloatArray]:
+def _of_configured_optics(tested: Mapping[str, Any], config: Config, table: pd.DataFrame) -> Sigmas:
     """Give the error that configured optics may have, by the images on which they were tested."""
     errors = OpticsCovariance(names=tested["names"], matrix=tested["covariance"])
     field = config.optics.field_px or tested.get("field_px")
@@ -460,7 +449,7 @@ def _base_shifts(
     return shifts
 
 
-def _of_the_standards(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
+def _of_the_standards(config: Config, table: pd.DataFrame) -> Sigmas:
     """Give what the learned optics of the standards may be wrong by, where they are others."""
     line, pixel = config.calibration, config.camera.pixel_size_nm
     if line is None or line.optics is None or line.covariance is None or pixel is None:
@@ -473,7 +462,7 @@ def _of_the_standards(config: Config, table: pd.DataFrame) -> Mapping[str, Float
     return {"mass_kda": _masses(table) * math.sqrt(max(variance, 0.0))}
 
 
-def _of_the_template(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
+def _of_the_template(config: Config, table: pd.DataFrame) -> Sigmas:
     """Give what the peak of a measured picture may be wrong by.
 
     All contrasts share its relative error.  The standards of a line that was measured with the
@@ -501,7 +490,7 @@ INPUTS = {
 what shrinks its error.  Standards of the same set-up take all of them away."""
 
 
-def assumed_error(key: str, config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
+def assumed_error(key: str, config: Config, table: pd.DataFrame) -> Sigmas:
     """Error of the masses of a movie that the uncertainty of one input makes.
 
     If an input is off by δ, the pictures are those of the input plus δ, and the fit imitates the
@@ -547,9 +536,7 @@ def assumed_error(key: str, config: Config, table: pd.DataFrame) -> Mapping[str,
     return {"mass_kda": share * mass}
 
 
-def _of_spheres(
-    key: str, config: Config, table: pd.DataFrame, sigma: float
-) -> Mapping[str, FloatArray]:
+def _of_spheres(key: str, config: Config, table: pd.DataFrame, sigma: float) -> Sigmas:
     """Error of the masses of spheres, which follow from their pictures without standards.
 
     An index that was fitted is not assumed, and takes its part of what other inputs have wrong.
