@@ -434,7 +434,9 @@ CURVE_COLUMNS = ("mass_kda", "density", "density_se", "model", "model_corrected"
 
 _NOISES = np.linspace(0.05, 0.95, 10)  # quantiles that stand for the errors of all events
 
-_POINTS = 300
+POINTS = 300
+"""Of a curve."""
+
 _MOST_BINS = 240
 
 
@@ -479,7 +481,7 @@ def mean_density(events: Events, best: Mixture, x: FloatArray) -> FloatArray:
 
 def curves_of(events: Events, best: Mixture, bandwidth: float) -> pd.DataFrame:
     """Give densities per kDa: kernel with its Poisson error, model as seen and as it came."""
-    mass = np.linspace(0.0, _reach(events), _POINTS)
+    mass = np.linspace(0.0, _reach(events), POINTS)
     z = (mass[:, np.newaxis] - events.x) / bandwidth
     kernel = np.exp(-0.5 * z**2) / (math.sqrt(2 * math.pi) * bandwidth)
     arrived = best.arrived(events) * mean_density(events, best, mass)

@@ -39,6 +39,7 @@ from iscat_analysis.species.choices import Searched
 from iscat_analysis.species.describe import (
     LEAST_EVENTS,
     LEAST_SPECIES,
+    POINTS,
     histogram_of,
     interval_of,
     mean_density,
@@ -68,7 +69,6 @@ _LEAST_PRIOR = 0.25  # of the variance of an error: a population that is narrowe
 _LEAST_TOLD = 0.05  # of the information of an error
 _NODES = np.linspace(-6.0, 6.0, 61)  # standard deviations
 
-_POINTS = 300
 _MARGIN = 3.0  # standard deviations of a curve beyond the outermost diameters
 
 
@@ -204,7 +204,7 @@ def _curve(events: Events, best: Mixture) -> pd.DataFrame:
     """Give the density per nm that the populations and the errors make."""
     reach = _MARGIN * float(np.median(events.sigma))
     ends = np.exp([events.x.min() - reach, events.x.max() + reach])
-    diameter = np.linspace(ends[0], ends[1], _POINTS)
+    diameter = np.linspace(ends[0], ends[1], POINTS)
     density = events.x.size * mean_density(events, best, np.log(diameter)) / diameter
     return pd.DataFrame({"diameter_nm": UNIT_NM * diameter, "model": density / UNIT_NM})
 

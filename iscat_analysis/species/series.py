@@ -37,18 +37,18 @@ from numpy.typing import NDArray
 from scipy.special import expit, log_ndtr, ndtr, softmax
 
 from iscat_analysis._kernels.mixture import mixture_score
+from iscat_analysis.medians import SIGMA_PER_MAD
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.choices import top_of
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.maximum import Problem
-from iscat_analysis.species.structure import LOGIT_REACH, width_prior
+from iscat_analysis.species.structure import LOGIT_REACH, WIDTH_STEP, width_prior
 
 _MASS_RANGE = 0.2  # of the masses that were given
 _OFFSET = 0.05  # of the lightest mass
 # Of the lightest, times the root of the mass over its: standard deviation of a species
 _WIDEST = 0.35
 _LONGEST, _FIRST_TAIL = 2.0, 0.2  # of a peak's width: a tail
-_WIDTH_STEP = 0.3  # of the logarithm of a width
 _CUTS = (0.0, 0.5, 1.2, 2.3, np.inf)  # of an exponential of mean 1: its parts are nearly normal
 _OVERLAP = 0.5  # width of a part of the background over the distance to its neighbours
 # Of a peak's width: a tail; less, and a tail of one width is taken for a limit
@@ -65,9 +65,7 @@ _EDGE_QUANTILE = 0.02  # quantile of the events where their edge is sought
 _ABOVE_RISE = 3.0  # of a peak's width: how far above that edge the limit may lie
 _NODES = 64
 _PEAK_REACH = 0.4  # of the lightest mass: events of a peak
-_SIGMA_PER_MAD = 1.4826
 _TINY = 1e-290
-_COMPLEX_STEP = 1e-30  # of a parameter: its square is nothing beside 1
 
 
 def _segments() -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -160,7 +158,7 @@ class Series:
         narrowest, log_width = math.log(self.noise) / 2, math.log(self.width)
         for mass in self.masses:
             widest = max(_WIDEST * math.sqrt(lightest * mass), 2 * math.sqrt(self.noise))
-            parts.append((narrowest, math.log(widest), log_width, _WIDTH_STEP))
+            parts.append((narrowest, math.log(widest), log_width, WIDTH_STEP))
         parts.append((-_LONGEST, _LONGEST, _FIRST_TAIL, 1.0))
         self.tail = len(parts) - 1
         parts += [(-LOGIT_REACH, LOGIT_REACH, 0.0, 1.0)] * (self.knots.size - 1)
@@ -187,7 +185,7 @@ class Series:
         for mass in self.masses:
             near = x[np.abs(x - mass) < _PEAK_REACH * lightest]
             if near.size > 0.05 * x.size:
-                found.append(_SIGMA_PER_MAD * float(np.median(np.abs(near - np.median(near)))))
+                found.append(SIGMA_PER_MAD * float(np.median(np.abs(near - np.median(near)))))
         return min(max(min(found, default=0.12 * lightest), 0.02 * lightest), 0.3 * lightest)
 
     def _middles(self) -> FloatArray:
@@ -335,8 +333,8 @@ class Series:
         Shapes: `theta` (p,), results (tables,), (tables, shares + k).
         """
         common, logits, share = theta[: self.shares], self.logits(theta), self.background(theta)
-        steps = common + 1j * _COMPLEX_STEP * np.eye(common.size)
-        rises = self._parts(steps).imag / _COMPLEX_STEP
+        step = 1e-30  # whose square is nothing beside 1
+        rises = self._parts(common + 1j * step * np.eye(common.size)).imag / step
         log_part, mean, variance = self._parts(common)
         kinds, first = softmax(logits, axis=1), SHARES.size * np.arange(self.kinds + 1)
         of_kind = np.hstack([kinds * (1 - share)[:, None], share[:, None]])

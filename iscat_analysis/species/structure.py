@@ -43,6 +43,9 @@ from iscat_analysis.species.mixture import Kinds, Mixture
 LOGIT_REACH = 12.0
 """Weights stay within a factor of e to this power of that of the first species."""
 
+WIDTH_STEP = 0.3
+"""Of ln T: a typical step."""
+
 
 class Means(NamedTuple):
     """Means that are linear in some parameters, and the limits of these.
@@ -215,7 +218,7 @@ def structure_of(
         noise,
         low=np.concatenate([-reach, means.limits[0], np.full(q, math.log(unit))]),
         high=np.concatenate([reach, means.limits[1], np.log(np.maximum(most, 2 * unit))]),
-        scale=np.concatenate([np.ones(of_mean), np.full(p, unit), np.full(q, _WIDTH_STEP)]),
+        scale=np.concatenate([np.ones(of_mean), np.full(p, unit), np.full(q, WIDTH_STEP)]),
         rows=np.hstack([np.zeros((middle.size, of_width)), rows @ widths]),
         middle=middle,
         broad=start.broad,
@@ -260,7 +263,6 @@ def fit_jointly(
 
 
 _HARDLY_SEEN = -1.88  # standard deviations above the threshold, where 3 % are seen
-_WIDTH_STEP = 0.3  # of ln T
 _LEAST_WEIGHT = 1e-6  # of a component that a sample lacks, at a start
 
 _POWER, _POWER_SPREAD = 0.5, 0.5

@@ -100,7 +100,6 @@ NO_PLACE = (Status.NOT_CONVERGED, Status.SIDELOBE, Status.TOO_CLOSE)
 """Of rows that do not say how a particle moves."""
 
 _LARGEST_ERROR_RATIO = 300.0  # times the median error: such a place says nothing
-_FRAMES_APART_NM = 1e9  # between two frames, where neighbours of each are searched for
 
 
 @dataclass(frozen=True)
@@ -188,19 +187,15 @@ def rows_by_track(fits: pd.DataFrame) -> dict[int, TrackRows]:
 def nearest_nm(groups: Mapping[int, TrackRows]) -> dict[int, float]:
     """Smallest distance of each track to any other in the same frame [nm]."""
     own = np.repeat(np.arange(len(groups)), [len(rows.frame) for rows in groups.values()])
-    place = np.concatenate(
-        [
-            np.stack([rows.frame * _FRAMES_APART_NM, rows.x_nm, rows.y_nm])
-            for rows in groups.values()
-        ]
-        or [np.zeros((3, 0))],
-        axis=1,
-    ).T
+    every = [np.stack([rows.frame, rows.x_nm, rows.y_nm]) for rows in groups.values()]
+    place = np.concatenate(every or [np.zeros((3, 0))], axis=1).T
     known = np.isfinite(place).all(axis=1)
     own, place = own[known], place[known]
+    far = 3 * np.abs(place[:, 1:]).max(initial=1.0)  # apart are frames: nothing else is as far
+    place[:, 0] *= far
     apart, other = scipy.spatial.cKDTree(place).query(place, k=3)  # itself, and two others
     of_track = np.append(own, -1)[other] == own[:, None]
-    apart[of_track | (apart >= _FRAMES_APART_NM)] = np.inf
+    apart[of_track | (apart >= far)] = np.inf
     closest = np.full(len(groups), np.inf)
     np.fmin.at(closest, own, apart.min(axis=1))
     return dict(zip(groups, closest.tolist(), strict=True))

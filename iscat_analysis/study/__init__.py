@@ -41,13 +41,26 @@ if TYPE_CHECKING:
         score_estimates,
     )
 
-_MODULES = "estimator_setup scores simulate yardstick setting trials posteriors efficiency"
+_MODULES = (
+    "estimator_setup", "scores", "simulate", "yardstick", "setting", "trials", "posteriors",
+    "efficiency",
+)  # fmt: skip
 """Searched in this order when a name is first used, so that estimators start soon."""
+
+__all__ = [
+    "MIN_TRIALS", "OF_DIPOLES", "OF_SPHERES", "RANKS", "EstimatorSetup", "Limits", "Movie",
+    "PosteriorRanks", "Score", "Setting", "Trials", "beside_best",
+    "calibrate_posterior", "detection_snr", "limits_of_alike", "limits_of_many",
+    "make_setting", "matched", "mean_interval", "paired", "power_bound", "pull_histogram",
+    "rank_test", "recall_at", "resamples", "run_trials", "score", "score_estimates",
+    "setup_of", "share", "share_interval", "spread_error", "spread_interval",
+    "trial_generator", "write_stack",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
     """Import a name where it is first used."""
-    for module in () if name.startswith("_") else _MODULES.split():
+    for module in _MODULES if name in __all__ else ():
         found = vars(import_module(f"iscat_analysis.study.{module}"))
         if name in found:
             return found[name]
