@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -131,11 +132,16 @@ def test_a_peak_with_a_tail_is_nearly_the_exponentially_modified_normal(tail: fl
     assert SHARES @ means == pytest.approx(tail * width)
 
 
+def drawn(
+    seed: int | list[int], mass_kda: float, number: int, kd_nm: float = 10.0, **more: Any
+) -> list[pd.DataFrame]:
+    totals, random = DIMER.to_numpy(float), np.random.default_rng(seed)
+    return draw_series(random, "dimer", totals, kd_nm, [mass_kda], number=number, **more)
+
+
 @pytest.fixture(scope="module")
 def dimers() -> list[pd.DataFrame]:
-    random = np.random.default_rng(6)
-    totals = DIMER.to_numpy(float)
-    return draw_series(random, "dimer", totals, 10.0, [66.0], number=900, efficiency=EFFICIENCY)
+    return drawn(6, 66.0, 900, efficiency=EFFICIENCY)
 
 
 @pytest.fixture(scope="module")
@@ -172,9 +178,7 @@ def test_kd_is_found_and_its_ends_are_where_the_profile_says(dimers) -> None:
 @pytest.mark.parametrize("seed", [2, 4, 15])
 def test_ends_are_on_the_profile_where_events_are_few(seed: int) -> None:
     """Sixty events a table, for which the errors of MINOS end elsewhere."""
-    totals = DIMER.to_numpy(float)
-    random = np.random.default_rng([91, seed])
-    tables = draw_series(random, "dimer", totals, 10.0, [66.0], number=60)
+    tables = drawn([91, seed], 66.0, 60)
     fit = ia.fit_kd(DIMER, tables=tables, model="dimer", masses_kda=[64.0]).fit
     assert fit.kd_low < fit.kd_nm < fit.kd_high
     assert fit.profile_ln_kd[[0, -1]] == pytest.approx(np.log([fit.kd_low, fit.kd_high]))
@@ -200,8 +204,7 @@ def test_a_mass_in_another_unit_is_refused(dimers) -> None:
 
 def test_a_monomer_that_is_hardly_detected_gives_no_kd() -> None:
     """Of monomers of 40 kDa one in a hundred passes 65 kDa."""
-    totals = DIMER.to_numpy(float)
-    tables = draw_series(np.random.default_rng(12), "dimer", totals, 10.0, [40.0], number=1000)
+    tables = drawn(12, 40.0, 1000)
     seen = [table[table["mass_kda"] > 65][["mass_kda"]].head(200) for table in tables]
     with pytest.raises(ia.DataError, match=r"of the species of about .* K_D is not determined"):
         ia.fit_kd(DIMER, tables=seen, model="dimer", masses_kda=[40.0])
@@ -209,9 +212,7 @@ def test_a_monomer_that_is_hardly_detected_gives_no_kd() -> None:
 
 def test_the_monomer_is_taken_from_two_peaks() -> None:
     """40 kDa explained peaks at 80 and 160 kDa as well, and were taken."""
-    totals = DIMER.to_numpy(float)
-    tables = draw_series(np.random.default_rng(10), "dimer", totals, 10.0, [80.0], number=600)
-    found = ia.fit_kd(DIMER, tables=tables, model="dimer")
+    found = ia.fit_kd(DIMER, tables=drawn(10, 80.0, 600), model="dimer")
     assert found.fit.masses_kda == pytest.approx([80, 160], abs=2)
     assert found.fit.kd_low < 10 < found.fit.kd_high
     (note,) = [note for note in found.notes if "the monomer was taken" in note]
@@ -236,8 +237,7 @@ def test_dimers_may_be_twice_as_wide_as_monomers(seed: int) -> None:
 
 
 def test_peaks_that_are_no_ladder_need_the_mass() -> None:
-    totals = DIMER.to_numpy(float)
-    tables = draw_series(np.random.default_rng(11), "dimer", totals, 1e-5, [80.0], number=300)
+    tables = drawn(11, 80.0, 300, 1e-5)
     with pytest.raises(ia.DataError, match=r"which peak .* is the monomer cannot be told.*160 kDa"):
         ia.fit_kd(DIMER, tables=tables, model="dimer")
 
