@@ -77,8 +77,7 @@ def test_the_scatter_of_one_mass_is_not_remarked_on_and_that_of_two_is() -> None
     rng = np.random.default_rng(3)
     sigma = np.full(100, 20.0)
     p_values = [
-        combine_masses(400 + 20 * rng.standard_normal(100), sigma, sigma).p_mass
-        for _ in range(200)
+        combine_masses(400 + 20 * rng.standard_normal(100), sigma, sigma).p_mass for _ in range(200)
     ]
     assert abs(np.mean(p_values) - 0.5) < SIGMAS / math.sqrt(12 * 200)
     two = np.where(np.arange(100) < 50, 380.0, 420.0) + 20 * rng.standard_normal(100)
