@@ -46,11 +46,6 @@ class FieldSample:
         ]
         return cls(shape, tuple(corners))
 
-    @property
-    def pixels(self) -> int:
-        """Pixels that are looked at."""
-        return _SIDE**2 * len(self.corners)
-
     def taken(self, images: NDArray[Any]) -> NDArray[Any]:
         """Cut the squares out of images and put them side by side.
 
@@ -91,7 +86,7 @@ class FieldSample:
     def summary(self, ratio: float, error: float) -> dict[str, Any]:
         """Give what ``summary.json`` says of it."""
         return {
-            "pixels": self.pixels,
+            "pixels": _SIDE**2 * len(self.corners),
             "of": math.prod(self.shape),
             "side_px": _SIDE,
             "corners_px": [list(corner) for corner in self.corners],
