@@ -6,7 +6,21 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from iscat_analysis.schemas.base import Closed, Count, Document, Natural, Number, Share, key, maybe
+from iscat_analysis.schemas.base import (
+    Closed,
+    Count,
+    Document,
+    Error,
+    High,
+    Low,
+    Natural,
+    Notes,
+    Number,
+    Share,
+    Written,
+    key,
+    maybe,
+)
 from iscat_analysis.schemas.fit import Distribution
 
 
@@ -15,13 +29,13 @@ class LadderFit(Closed):
 
     steps: list[int] = key("n of each rung")
     monomer_kda: float = key("Its mass [kDa]")
-    monomer_se: Number = key("Its statistical standard error [kDa]")
-    monomer_low: Number = key("End of its 95 % interval [kDa]")
-    monomer_high: Number = key("The other end [kDa]")
+    monomer_se: Error
+    monomer_low: Low
+    monomer_high: High
     offset_kda: float = key("Offset [kDa]")
-    offset_se: Number = key("Its statistical standard error [kDa]")
-    offset_low: Number = key("End of its 95 % interval [kDa]")
-    offset_high: Number = key("The other end [kDa]")
+    offset_se: Error
+    offset_low: Low
+    offset_high: High
     held: bool = key("Whether the monomer was given and not fitted")
     p_value: Number = key("Of a ladder against free masses; null where they are as many")
 
@@ -32,11 +46,11 @@ class LandingRate(Closed):
     landings: Count = key("Landings that were seen")
     seconds: float = key("Time in which they were [s]")
     per_second: Number = key("Rate in the beginning, of landings that are seen [1/s]")
-    per_second_low: Number = key("End of its 95 % interval [1/s]")
-    per_second_high: Number = key("The other end [1/s]")
+    per_second_low: Low
+    per_second_high: High
     depletion_per_s: Number = key("Rate at which it falls [1/s]")
-    depletion_low: Number = key("End of its 95 % interval [1/s]")
-    depletion_high: Number = key("The other end [1/s]")
+    depletion_low: Low
+    depletion_high: High
     depletion_p: Share = key("Chance of such a change if the rate is constant")
     p_value: Share = key("Chance of times that are as far from this law if it is true")
 
@@ -48,8 +62,8 @@ class UnbindingRate(Closed):
     pairs: Count = key("Those with a leaving")
     chance_pairs: Count = key("Pairs found where leavings are moved by half of the field")
     per_second: Number = key("Rate [1/s]")
-    per_second_low: Number = key("End of its 95 % interval [1/s]")
-    per_second_high: Number = key("The other end [1/s]")
+    per_second_low: Low
+    per_second_high: High
 
 
 class Kinetics(Closed):
@@ -59,7 +73,7 @@ class Kinetics(Closed):
     unbinding: UnbindingRate | None = key("Leavings; null if there are none, or no positions")
     frame_rate_hz: float = key("Frames per second")
     frames: tuple[int, int] = key("In which events were looked for, [start, stop)")
-    notes: list[str] = key("What the user should know, one line each")
+    notes: Notes
 
 
 class Species(Distribution):
@@ -68,7 +82,7 @@ class Species(Distribution):
     source: str = key("The table of events")
     ladder: LadderFit = maybe("With --ladder: the monomer")
     kinetics: Kinetics = maybe("Rates, where the frames per second are known")
-    out: str = maybe("When printed: the folder that was written")
+    out: Written
 
 
 class Test(Closed):
@@ -102,8 +116,8 @@ class SpeciesComparison(Document):
 
     source: str = key("The table that the others are compared with")
     comparisons: list[SampleComparison] = key("One for each other table")
-    notes: list[str] = key("What the user should know, one line each")
-    out: str = maybe("When printed: the folder that was written")
+    notes: Notes
+    out: Written
 
 
 class Kd(Document):
@@ -117,14 +131,10 @@ class Kd(Document):
     inactive: float = key("Part of monomers, or of A, that does not bind; 0 where not fitted")
     inactive_se: Number = key("Its standard error; null where it was not fitted")
     inactive_p: Share = key("Chance of such a gain by an inactive part if there is none")
-    masses_kda: list[float] = key(
-        "Masses at which the species' peaks are highest [kDa], the complex last"
-    )
+    masses_kda: list[float] = key("Highest points of the species' peaks [kDa], the complex last")
     width_kda: float = key("Width of the lightest species beside the events' own errors [kDa]")
     tail_kda: float = key("Mean of the peaks' exponential tail, negative to low masses [kDa]")
-    limit_kda: Number = key(
-        "Mass that is detected with probability 1/2, from the edge of the tables [kDa]"
-    )
+    limit_kda: Number = key("Mass detected with probability 1/2, from the edge of the tables [kDa]")
     landing_power: float = key("p of landings ∝ concentration·mass^p")
     landing_power_se: float = key("Its standard error; 0 where it was given")
     chi2: float = key("Twice the gain of fractions that are free in every table")
@@ -137,8 +147,8 @@ class Kd(Document):
     )
     curve: dict[str, Any] = key("Model dimer: columns concentration_nm and complexes")
     profile: dict[str, Any] = key("ln_kd_nm, and twice the log-likelihood lost there")
-    notes: list[str] = key("What the user should know, one line each")
-    out: str = maybe("When printed: the folder that was written")
+    notes: Notes
+    out: Written
 
 
 Text = str | None
@@ -199,16 +209,16 @@ class DaySpecies(Document):
     role: str = key("Of the movie")
     kind: Count = key("The same for species of several movies with one mass; 0 for outliers")
     mass_kda: Number = key("Mass [kDa]")
-    mass_se: Number = key("Its statistical standard error [kDa]")
-    mass_low: Number = key("End of its 95 % interval [kDa]")
-    mass_high: Number = key("The other end [kDa]")
+    mass_se: Error
+    mass_low: Low
+    mass_high: High
     mass_systematic: Number = key("Error that the movie's masses have in common [kDa]")
     width_kda: Number = key("Width beyond the noise [kDa]")
-    width_low: Number = key("End of its 95 % interval [kDa]")
-    width_high: Number = key("The other end [kDa]")
+    width_low: Low
+    width_high: High
     count: Number = key("Events")
-    count_low: Number = key("End of its 95 % interval")
-    count_high: Number = key("The other end")
+    count_low: Low
+    count_high: High
     fraction: Share = key("Of the particles that came")
     fraction_low: Share = key("End of its 95 % interval")
     fraction_high: Share = key("The other end")
@@ -216,14 +226,14 @@ class DaySpecies(Document):
     share_low: Share = key("End of its 95 % interval")
     share_high: Share = key("The other end")
     count_corrected: Number = key("Events and those that were missed")
-    corrected_low: Number = key("End of its 95 % interval")
-    corrected_high: Number = key("The other end")
+    corrected_low: Low
+    corrected_high: High
     landing: Number = key("Landings")
     leaving: Number = key("Leavings")
     efficiency: Number = key("Share of its particles that are detected")
     rate_per_s: Number = key("Landings per second, corrected")
-    rate_low: Number = key("End of its 95 % interval")
-    rate_high: Number = key("The other end")
+    rate_low: Low
+    rate_high: High
     outlier: bool = key("One or two events apart from all others")
 
 

@@ -43,6 +43,15 @@ def maybe(description: str) -> Any:
     return Field(default=None, description=description)
 
 
+Error = Annotated[Number, key("Its standard error")]
+KnownError = Annotated[NotNegative, key("Its standard error")]
+Ends = Annotated[Interval, key("Its 95 % confidence interval")]
+Low = Annotated[Number, key("End of its 95 % interval")]
+High = Annotated[Number, key("The other end")]
+Notes = Annotated[list[str], key("What the user should know, one line each")]
+Written = Annotated[str, maybe("When printed: the folder that was written")]
+
+
 class Document(BaseModel):
     """A document, or a part of one, that may have further keys."""
 

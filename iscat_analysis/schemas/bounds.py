@@ -15,6 +15,7 @@ from iscat_analysis.schemas.base import (
     Matrix4,
     Mode,
     Natural,
+    Notes,
     NotNegative,
     Number,
     Parameter,
@@ -55,22 +56,24 @@ class Scattered(Document):
     collected: float = key("Through the pupil")
 
 
-class PerPhoton(Closed):
-    """Standard deviations for one photon."""
+class Place(Closed):
+    """Standard deviations of the position."""
 
     x_nm: Positive = key("[nm]")
     y_nm: Positive = key("[nm]")
     z_nm: Positive = key("[nm]")
+
+
+class PerPhoton(Place):
+    """Standard deviations for one photon."""
+
     mass_rel: Positive = key("Relative to the mass")
     z_nm_phase_free: Positive = maybe("The phase between particle and reference unknown [nm]")
 
 
-class Planned(Closed):
+class Planned(Place):
     """Standard deviations for the planned frames."""
 
-    x_nm: Positive = key("[nm]")
-    y_nm: Positive = key("[nm]")
-    z_nm: Positive = key("[nm]")
     mass_kda: Positive = key("[kDa]")
     z_nm_phase_free: Positive = maybe("The phase between particle and reference unknown [nm]")
 
@@ -85,15 +88,20 @@ class Kinds(Document, Generic[Sigma]):
     qcrb_dong2021: Sigma = key("Quantum, with the mode weight of Dong et al. (2021)")
 
 
-class Holevo(Closed):
-    """Holevo bound of one measurement of all free parameters, for the planned frames."""
+class Free(Closed):
+    """Standard deviations of the parameters that are free."""
 
-    weight: Literal["qfi"] = key("Every parameter weighs as much as the light knows of it")
-    sum: Positive = key("Tr WV; the number of free parameters where no two are in conflict")
     x_nm: Positive = maybe("[nm]")
     y_nm: Positive = maybe("[nm]")
     z_nm: Positive = maybe("[nm]")
     mass_kda: Positive = maybe("[kDa]")
+
+
+class Holevo(Free):
+    """Holevo bound of one measurement of all free parameters, for the planned frames."""
+
+    weight: Literal["qfi"] = key("Every parameter weighs as much as the light knows of it")
+    sum: Positive = key("Tr WV; the number of free parameters where no two are in conflict")
 
 
 class Crosstalk(Document):
@@ -198,13 +206,9 @@ class Target(Document):
     note: str
 
 
-class RodSigma(Closed):
+class RodSigma(Free):
     """Standard deviations of a rod for the planned frames; null where not identifiable."""
 
-    x_nm: Positive = maybe("[nm]")
-    y_nm: Positive = maybe("[nm]")
-    z_nm: Positive = maybe("[nm]")
-    mass_kda: Positive = maybe("[kDa]")
     azimuth_deg: Positive = key("Of the direction in the image [degrees]")
     tilt_deg: Positive = key("Of the angle to the optical axis [degrees]")
 
@@ -227,26 +231,18 @@ class Bounds(Document):
     n_scattered: Scattered = key("Scattered photons in all frames after")
     per_photon: Kinds[PerPhoton] = key("For one scattered photon [nm; mass_rel is relative]")
     actual: Kinds[Planned] = key("For the planned frames [nm, kDa]")
-    fisher: Matrix4 = key(
-        "Fisher information of all frames, order x, y, z, mass [1/nm², 1/(nm kDa), 1/kDa²]"
-    )
+    fisher: Matrix4 = key("Fisher information, order x, y, z, mass [1/nm², 1/(nm kDa), 1/kDa²]")
     qfi: Matrix4 = key("Quantum Fisher information of the light")
-    qfi_imaginary: Matrix4 = key(
-        "Its imaginary part; where not zero, no single measurement is best for both parameters"
-    )
+    qfi_imaginary: Matrix4 = key("Its imaginary part; 0 where one measurement is best for both")
     holevo: Holevo = key("Holevo bound over the mode's free parameters")
     information_fraction: dict[Parameter, Number] = key("Share of the light's information")
-    information_fraction_joint: dict[Parameter, Number] = key(
-        "Share of the best measurement of all free parameters: (Holevo / CRB joint)²"
-    )
-    incompatible: dict[str, float] = key(
-        "Pairs that no single measurement estimates best, and how strongly, from 0 to 1"
-    )
+    information_fraction_joint: dict[Parameter, Number] = key("(Holevo / CRB joint)²")
+    incompatible: dict[str, float] = key("Pairs that no measurement estimates best, from 0 to 1")
     unidentifiable: list[str] = key("Directions that the image does not show")
     crosstalk: Crosstalk = key("The direction worst hidden among the free parameters")
     convention: Convention = key("Formulas")
     emission: Emission = key("Emission model")
-    warnings: list[str] = key("What the user should know, one line each")
+    warnings: Notes
     rod: RodBounds = maybe('With particle.model = "rod"')
     detection: DetectionLimit = maybe("Smallest mass that is detected; not in dark field")
     scan: Scan = maybe("With --scan")
@@ -285,15 +281,11 @@ class OpticsBounds(Document):
     names: list[str] = key("Parameters, in the order of covariance")
     covariance: list[list[Number]] = key("Of these, fitted together")
     unidentifiable: list[str] = key("Parameters of which the images tell little, one sentence each")
-    common: dict[str, dict[Parameter, Number]] = key(
-        "Mode: standard deviation common to all fits, from the error of the optics [nm, kDa]"
-    )
-    single: dict[str, dict[Parameter, Number]] = key(
-        "Mode: Cramér–Rao bound of one particle if the optics are known [nm, kDa]"
-    )
+    common: dict[str, dict[Parameter, Number]] = key("By mode: σ that all fits share [nm, kDa]")
+    single: dict[str, dict[Parameter, Number]] = key("The same: CRB of one if they are known")
     goals: dict[str, float] = key("Precisions for which the number of particles is given")
     needed: list[EventsNeeded] = key("Their price, for several masses")
-    warnings: list[str] = key("What the user should know, one line each")
+    warnings: Notes
 
 
 class Table1Row(Closed):

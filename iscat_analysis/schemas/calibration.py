@@ -8,9 +8,12 @@ from iscat_analysis.schemas.base import (
     Closed,
     Count,
     Document,
+    KnownError,
+    Notes,
     NotNegative,
     Number,
     Share,
+    Written,
     key,
     maybe,
 )
@@ -20,7 +23,7 @@ class Estimate(Closed):
     """A measured number."""
 
     value: float = key("The estimate")
-    se: NotNegative = key("Its standard error")
+    se: KnownError
     ci95: tuple[float, float] = key("Its 95 % interval")
 
 
@@ -56,24 +59,22 @@ class Camera(Document):
     offset_from: Literal["dark", "given", "flicker", "line"] = key("Where the offset is from")
     read_noise_adu: Estimate | None = key("Read noise, standard deviation [counts]")
     read_noise_e: Estimate | None = key("Read noise, standard deviation [e]")
-    read_noise_below_e: NotNegative | None = key(
-        "Upper limit, 95 %, of a read noise too small to measure [e]"
-    )
+    read_noise_below_e: NotNegative | None = key("95 % limit of one too small [e]")
     shot_limited_frames: Count | None = key("Frames that may be averaged before other noise shows")
     verdict: str = key("The same as a sentence")
     frames: Count = key("Frames that were used")
     masked_pixels: dict[str, Count] = key("Pixels left out, by reason")
     photon_transfer: PhotonTransfer = key("Variance against mean")
     noise: Averaging = key("Noise against averaging")
-    notes: list[str] = key("What the user should know, one line each")
-    out: str = maybe("The folder that was written; not in the file")
+    notes: Notes
+    out: Written
 
 
 class ContrastPeak(Closed):
     """A peak of the contrasts."""
 
     contrast: NotNegative = key("Size of the peak's contrast")
-    contrast_se: NotNegative = key("Its standard error")
+    contrast_se: KnownError
     width: NotNegative = key("Standard deviation of the peak beyond the events' own")
     count: NotNegative = key("Events in it")
 
@@ -82,9 +83,9 @@ class Standard(Closed):
     """A standard, and the mass of its peak on the line."""
 
     mass_kda: float = key("Known mass [kDa]")
-    mass_se: NotNegative = key("Its standard error [kDa]")
+    mass_se: KnownError
     contrast: float = key("Signed contrast of its peak")
-    contrast_se: NotNegative = key("Its standard error")
+    contrast_se: KnownError
     width: NotNegative = key("Standard deviation of the peak beyond the events' own")
     count: NotNegative = key("Events in it")
     found_kda: float = key("Its mass by the line [kDa]")
@@ -134,22 +135,20 @@ class MassCalibration(Document):
 
     source: str = maybe("In the file: the table of events")
     gradient_per_kda: float = key("Signed peak contrast per kDa")
-    gradient_se: NotNegative = key("Its standard error")
+    gradient_se: KnownError
     offset: float = key("Contrast at zero mass")
-    offset_se: NotNegative = key("Its standard error")
+    offset_se: KnownError
     covariance: tuple[tuple[float, float], tuple[float, float]] = key("Of gradient and offset")
     chi2: NotNegative = key("χ² of the standards about the line")
     dof: Count = key("Its degrees of freedom")
-    landing: Literal["dark", "bright"] = key(
-        "Whether a landing particle makes its position darker or brighter"
-    )
+    landing: Literal["dark", "bright"] = key("What a landing particle makes its position")
     events: Count = key("Landing events that were used")
     standards: list[Standard] = key("The standards, lightest first")
     peaks: list[ContrastPeak] = key("Every peak that was found")
-    notes: list[str] = key("What the user should know, one line each")
+    notes: Notes
     recorded: Standards | None = key("Optics and camera of the standards, null if unknown")
     histogram: Histogram = maybe("In the file: sizes of the contrasts")
-    out: str = maybe("The folder that was written; not in the file")
+    out: Written
 
 
 class OpticsParameter(Closed):
@@ -194,7 +193,7 @@ class Template(Document):
     roi_nm: float = key("Side of the square in which it is known [nm]")
     held_out: HeldOut = key("Pictures that were held out, by a template of the others")
     source: dict[str, str] = key("Source of the images")
-    out: str = maybe("When printed: the output folder")
+    out: Written
 
 
 class OpticsPictures(Closed):
@@ -233,8 +232,8 @@ class Optics(Document):
     contaminated: Count = key("Pictures left out because something else happened in them")
     source: dict[str, str] = key("Movie, its hash, and the program's version")
     pictures: OpticsPictures = maybe("In the file: data of the page")
-    notes: list[str] = key("What the user should know, one line each")
-    out: str = maybe("The folder that was written; not in the file")
+    notes: Notes
+    out: Written
 
 
 class Learned(Closed):
@@ -243,13 +242,8 @@ class Learned(Closed):
     tested: Count = maybe("Bright isolated particles, or tracks")
     median_p: Share = maybe("Median p-value of the brightest with the configured optics")
     log_bayes_factor: Number = maybe("Of other optics over the configured ones, by all images")
-    left_over: Number = maybe(
-        "What the configured optics leave over of the images, beyond the noise, over the images "
-        "(root mean square)"
-    )
-    left_over_then: Number = maybe(
-        "The same with learned optics that are used although images that were held out reject them"
-    )
+    left_over: Number = maybe("Residual image of the configured optics over the image, rms")
+    left_over_then: Number = maybe("Of learned optics used though held-out images reject them")
     calibrated: bool = key("Whether the analysis used learned optics")
     reason: str = maybe("Why not, if the test asked for it or was not possible")
     accepted: bool = maybe("Whether the learned optics could be used")
@@ -257,11 +251,7 @@ class Learned(Closed):
     parameters: list[OpticsParameter] = maybe("Every parameter")
     names: list[str] = maybe("Parameters that images may tell, in the order of covariance")
     values: list[float] = maybe("Of the optics of the analysis, learned or as configured")
-    covariance: list[list[float]] = maybe(
-        "Of their errors, by images and by what is known without them"
-    )
-    field_px: list[float] | None = maybe(
-        "Centre x, y and half the longer side of the field of its terms [pixels]; null without any"
-    )
+    covariance: list[list[float]] = maybe("Of their errors, prior included")
+    field_px: list[float] | None = maybe("Centre x, y and half the longer side of its field [px]")
     twin: Twin | None = maybe("Second optics that are as likely")
     notes: list[str] = maybe("What the user should know, one line each")

@@ -13,8 +13,12 @@ from iscat_analysis.schemas.base import (
     Count,
     Document,
     Emission,
+    Error,
+    High,
+    KnownError,
     Mode,
     Natural,
+    Notes,
     NotNegative,
     Number,
     Parameter,
@@ -48,14 +52,10 @@ class FindingEntry(Closed):
 class Medians(Document):
     """Medians of one free parameter over the events that are ok."""
 
-    sigma_median: Number = key(
-        "Standard deviation from the curvature of the likelihood [nm or kDa]"
-    )
+    sigma_median: Number = key("Standard deviation by the likelihood's curvature [nm or kDa]")
     crb_median: Number = key("Cramér–Rao bound [nm or kDa]")
     qcrb_median: Number = key("Quantum Cramér–Rao bound [nm or kDa]")
-    holevo_median: Number = maybe(
-        "Holevo bound of all free parameters at once, if height and mass are both free [nm, kDa]"
-    )
+    holevo_median: Number = maybe("Holevo bound, if height and mass are both free [nm, kDa]")
     sigma_over_crb_median: Number = key("Near 1 by construction: σ and CRB are both from the model")
     information_fraction_median: Number = key(
         "(QCRB/CRB)², or (Holevo/CRB)² if height and mass are both free: the share of the light's "
@@ -69,12 +69,8 @@ class Medians(Document):
     repeat_over_crb_ci95: tuple[Number, Number] = maybe("Its 95 % interval")
     repeat_significance: Number = maybe("Its difference from 1, in standard errors")
     repeat_events: Count = maybe("Events whose frames were compared")
-    repeat_whole: bool = maybe(
-        "Whether the noise was seen at the full length of the windows; otherwise in parts of them"
-    )
-    repeat_frames: list[Number] = maybe(
-        "Frames averaged; in mode track, frames from a frame to the middle of the background"
-    )
+    repeat_whole: bool = maybe("Whether it holds at the full length of the windows")
+    repeat_frames: list[Number] = maybe("Frames averaged; in mode track, to the background")
     repeat_over_crb_by_frames: list[Number] = maybe(
         "Spread of averages of this number of the events' own frames over their bound; in mode "
         "track, spread of single frames at this distance from the background, without a particle"
@@ -141,9 +137,7 @@ class Noise(Document):
 class Background(Noise):
     """A movie with background frames: its noise, and its drift to the frames after."""
 
-    drift_px: tuple[float, float] | None = key(
-        "Drift of the fixed pattern along y and x [px]; null if there is no pattern to follow"
-    )
+    drift_px: tuple[float, float] | None = key("Of the fixed pattern along y and x [px]")
     drift_error_px: tuple[float, float] | None = key("Its standard errors [px]")
 
 
@@ -177,9 +171,7 @@ class Landing(Document):
         "of bright or badly described particles hide it"
     )
     searched_snr: NotNegative = maybe("Median signal-to-noise ratio of the events that are ok")
-    partly_searched: list[tuple[Count, Count, Share]] = maybe(
-        "Frames [start, stop) in which a part of the field was hidden, and the share that was not"
-    )
+    partly_searched: list[tuple[Count, Count, Share]] = maybe("[start, stop), share not hidden")
     frames_left_out: Count = maybe("Frames that the camera dropped or repeated")
     drift_px: list[float] | None = maybe("Drift over the movie along y and x [px]")
     drift_corrected: bool = maybe("Whether the motion of the fixed pattern was divided out")
@@ -194,20 +186,14 @@ class Landing(Document):
 class Injection(Closed):
     """Known particles added to the movie: how many were found again, and how well."""
 
-    stay_frames: Count | None = maybe(
-        "Least number of frames that an added particle stays; recall is not for shorter stays"
-    )
+    stay_frames: Count | None = maybe("Least stay of an added particle [frames]")
     added: Count = key("Steps added: each particle lands, and leaves unless the movie ends first")
     recovered: Count = key("Steps found again")
     recall: Share = key("Their share")
-    predicted: Share = maybe(
-        "Recall expected from the Fisher information of the masses added, in the share searched"
-    )
+    predicted: Share = maybe("Expected from the Fisher information where searched")
     isolated: Count = key("Steps with no other one near in place and time")
     recall_isolated: Share = key("Share of these that was found")
-    bias_rel: float = maybe(
-        "Mean relative error of the mass; from here on: of two or more isolated"
-    )
+    bias_rel: float = maybe("Mean relative error of the mass; of two or more isolated")
     bias_rel_se: NotNegative = maybe("Its standard error")
     spread_over_crb: NotNegative = maybe("Standard deviation of mass errors in units of their CRB")
     spread_over_crb_se: NotNegative = maybe("Its standard error")
@@ -222,7 +208,7 @@ class Across(Closed):
     mass_kda: Number = key("Its mass [kDa]")
     width_kda: Number = key("Its width beyond σ [kDa]")
     width_low: Number = key("End of the 95 % interval of the width [kDa]")
-    width_high: Number = key("The other end [kDa]")
+    width_high: High
     count: Number = key("Its events")
     spread_over_sigma: Number = key("Scatter of its events over their median σ")
     explained_kda: NotNegative = maybe("Width that the budget explains [kDa]")
@@ -255,12 +241,10 @@ class CameraLaw(Closed):
         "linear, offset, read noise, noisy light, gamma, saturation, or other light, which does "
         "not follow the laser"
     )
-    value: Number = key(
-        "Its parameter: the exponent of gamma, the filling of pixels, or a share of the light"
-    )
-    se: NotNegative = key("Its standard error")
+    value: Number = key("Exponent of gamma, filling of pixels, or share of light")
+    se: KnownError
     contrast: Number = key("Contrast that is measured, over the true one")
-    contrast_se: NotNegative = key("Its standard error")
+    contrast_se: KnownError
     alike: list[str] = key("Other laws that describe the pixels as well")
     flickers: bool = key("Whether the laser's power changes enough to distinguish the laws")
 
@@ -300,16 +284,14 @@ class Blocks(Closed):
         "Shift of the fixed pattern from the first frames to the last (y, x) [px]; null if it was "
         "not measured, or there is no pattern to follow"
     )
-    drift_over_counting: Number = key(
-        "Variance that this shift adds to a background within its block, over its counting noise"
-    )
+    drift_over_counting: Number = key("Variance it adds to a background over counting noise")
 
 
 class Heights(Closed):
     """Heights of the particles in mode mass, beyond the errors of each."""
 
     mean_nm: Number = key("Mean [nm]; if heights are held, one scoring step from there")
-    mean_se_nm: NotNegative = key("Its standard error [nm]")
+    mean_se_nm: KnownError
     sd_nm: NotNegative = key("Standard deviation of the heights [nm]")
     sd_ci95_nm: tuple[NotNegative, NotNegative] = key("Its 95 % interval [nm]")
     events: Count = key("Events used")
@@ -324,7 +306,7 @@ class Extension(Closed):
     """Width of the particles' images beyond that of the model."""
 
     variance_nm2: Number = key("Variance of positions along each axis, from the widths [nm²]")
-    variance_se_nm2: Number = key("Its standard error [nm²]")
+    variance_se_nm2: Error
     posterior_mean_nm2: Number = key("Mean of its posterior, with length, motion and prior [nm²]")
     posterior_sd_nm2: Number = key("Its standard deviation [nm²]")
     flagged: Count = key("Rows that are flagged extended for it")
@@ -336,11 +318,21 @@ class Fluctuation(Closed):
 
     probability: Share = key("Probability that contrasts fluctuate")
     relative: NotNegative = key("Standard deviation over the contrast, if they do")
-    relative_se: NotNegative = key("Its standard error")
+    relative_se: KnownError
     frames: NotNegative = key("Correlation time [frames]")
 
 
-class Distribution(Document):
+class Mixture(BaseModel):
+    """How a mixture of populations was chosen."""
+
+    selection: list[dict[str, Any]] = key("Log-likelihood and BIC of each number tried")
+    support: Number = key("Share of simulated repetitions in which BIC chose the same number")
+    draws: int = key("Simulated repetitions")
+    seed: int = key("Seed of the bootstrap")
+    notes: Notes
+
+
+class Distribution(Mixture, Document):
     """Species, as a mixture fitted to the events that are ok, each with its own error."""
 
     branch: Literal["magnitude", "landing", "leaving"] = key("Which events; magnitude: all, |mass|")
@@ -357,22 +349,15 @@ class Distribution(Document):
         "whose share is not known to a factor of three, is not determined, and count_corrected, "
         "fraction and interval are null"
     )
-    selection: list[dict[str, Any]] = key("Log-likelihood and BIC of each number of species tried")
-    support: Number = key("Share of simulated repetitions in which BIC chose the same number")
-    histogram: dict[str, Any] = key(
-        "Columns low_kda, high_kda [kDa], count, and its 95 % interval count_low, count_high"
-    )
+    histogram: dict[str, Any] = key("Columns low_kda, high_kda, count, count_low, count_high")
     curves: dict[str, Any] = key(
         "Columns mass_kda [kDa]; density (kernel), density_se, model and model_corrected [events "
         "per kDa]; efficiency"
     )
     bandwidth_kda: Number = key("Bandwidth of the kernel density [kDa]")
-    draws: int = key("Simulated repetitions")
-    seed: int = key("Seed of the bootstrap")
-    notes: list[str] = key("What the user should know")
 
 
-class Sizes(Closed):
+class Sizes(Mixture, Closed):
     """Populations of diameters, as a log-normal mixture in which each sphere has its own error."""
 
     spheres: Count = key("Spheres used")
@@ -382,15 +367,8 @@ class Sizes(Closed):
         "bootstrap, that of the median with the error common to all spheres, diameter_systematic; "
         "an outlier has fewer than three spheres"
     )
-    selection: list[dict[str, Any]] = key("Log-likelihood and BIC of each number that was tried")
-    support: Number = key("Share of simulated repetitions in which BIC chose the same number")
-    histogram: dict[str, Any] = key(
-        "Columns low_nm, high_nm [nm], count, and its 95 % interval count_low, count_high"
-    )
+    histogram: dict[str, Any] = key("Columns low_nm, high_nm, count, count_low, count_high")
     curve: dict[str, Any] = key("Columns diameter_nm [nm] and model [spheres per nm], with errors")
-    draws: int = key("Simulated repetitions")
-    seed: int = key("Seed of the bootstrap")
-    notes: list[str] = key("What the user should know")
 
 
 class BudgetEntry(Closed):
@@ -409,9 +387,7 @@ class Scale(Closed):
     """The conversion of the mass scale from the optics of the standards to those of the movie."""
 
     carried: Number = key("Contrast per kDa with these optics over that with the standards'")
-    optics: Literal["recorded", "configured"] = key(
-        "Source of the standards' optics: stored with the calibration, or else the configuration"
-    )
+    optics: Literal["recorded", "configured"] = key("Where the standards' optics come from")
     refusal: str | None = key("Why the model cannot convert the scale; rows are flagged")
 
 
@@ -459,9 +435,7 @@ class Timeline(Closed):
 
     frames: list[float] = key("Mean frames of the places at which some frames were looked at")
     light_e: list[Number] = key("Mean light of a pixel [photoelectrons]")
-    noise_over_expected: list[Number] = key(
-        "Variance between neighbouring frames over that of light and read noise"
-    )
+    noise_over_expected: list[Number] = key("Variance between frames over light and read noise")
     focus_nm: list[Number] = key("Focus with which the frames were fitted [nm]")
     drift_x_px: list[Number] = key("Shift of the fixed pattern along x from the first place [px]")
     drift_y_px: list[Number] = key("The same along y [px]")
@@ -492,10 +466,7 @@ class Summary(Document):
     scheme: Scheme = key("Optical scheme")
     emission: Emission = key("Emission model")
     convention: Convention = key("Formulas")
-    mass_scale: str = key(
-        "Where the mass scale comes from: a calibration, the volume and density of spheres, or the "
-        "model"
-    )
+    mass_scale: str = key("Its source: a calibration, volume and density of spheres, or the model")
     scale: Scale = maybe("With a calibration: its conversion to the optics of the movie")
     status: dict[str, Count] = key("Events by status")
     no_events: dict[str, Count] = maybe("Rows of fits.csv that are no events, by status")
@@ -526,22 +497,14 @@ class Summary(Document):
     tracks: Count = maybe("Mode track: tracks found")
     motion: Motion = maybe("Mode track: medians and counts of the tracks")
     budget: list[BudgetEntry] = maybe("If masses are fitted: the sources of their error")
-    across_particles: list[Across] = maybe(
-        "Width of each species beyond σ; if the model is rejected, poor fits are counted too"
-    )
+    across_particles: list[Across] = maybe("Width of each species beyond σ, poor fits counted")
     heights: Heights = maybe("Mode mass: mean and spread of the heights")
     extension: Extension = maybe("Mode mass: width of the images beyond that of the model")
-    fluctuation: Fluctuation = maybe(
-        "Mode mass: slow fluctuation of contrasts, if the frames speak for one"
-    )
+    fluctuation: Fluctuation = maybe("Mode mass: slow fluctuation of contrasts, if likely")
     repeats: Repeats = maybe("Whether the measured spread agrees with σ")
-    lines: Lines = maybe(
-        "If rows, columns or a smooth part of the light changed, and were corrected"
-    )
+    lines: Lines = maybe("Changes of rows, columns or smooth light, corrected")
     optics: Learned = maybe("If the optics were tested: the test, and the learned optics")
-    distribution: Distribution | None = maybe(
-        "Species; null if masses are not fitted once per event, and of spheres"
-    )
+    distribution: Distribution | None = maybe("Species; null if no masses, or of spheres")
     sizes: Sizes | None = maybe("Spheres: populations of diameters; null for fewer than ten")
 
 
@@ -565,9 +528,7 @@ class TrueEvent(Closed):
     y_nm: float = key("y_px times the pixel size [nm]")
     z_nm: float = key("Height above the coverslip [nm]")
     mass_kda: float = key("Mass [kDa]")
-    contrast: Number = key(
-        "Signed peak contrast; null in dark field and for particles that move up and down"
-    )
+    contrast: Number = key("Signed peak contrast; null in dark field, or if it moves up and down")
     track: int | None = maybe("Number of the track; null for particles that do not move")
     d_um2_s: Number = maybe("Diffusion coefficient along each axis [µm²/s]")
     x_middle_nm: Number = maybe("Column in the middle of the exposure; x_nm is its average [nm]")

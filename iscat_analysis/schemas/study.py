@@ -9,6 +9,8 @@ from iscat_analysis.schemas.base import (
     Count,
     Document,
     Emission,
+    Ends,
+    Error,
     Interval,
     Natural,
     Number,
@@ -23,20 +25,20 @@ class Score(Document):
     """How one free parameter was estimated [nm or kDa]."""
 
     bias: Number = key("Mean of estimate minus truth")
-    bias_se: Number = key("Its standard error")
+    bias_se: Error
     spread: Number = key("Standard deviation of the estimates")
-    spread_ci95: Interval = key("Its 95 % confidence interval")
+    spread_ci95: Ends
     spread_robust: Number = maybe("The same from the quartiles, which outliers do not touch")
     crb: Number = key("Joint Cramér–Rao bound")
     qcrb: Number = key("Quantum Cramér–Rao bound")
     spread_over_crb: Number = key("1 for an efficient estimator")
-    spread_over_crb_ci95: Interval = key("Its 95 % confidence interval")
+    spread_over_crb_ci95: Ends
     spread_over_qcrb: Number = key("Distance to the quantum bound")
     spread_over_qcrb_ci95: Interval = maybe("Its 95 % confidence interval")
     coverage68: Share = key("Share of intervals of 1 σ that hold the truth")
-    coverage68_ci95: Interval = key("Its 95 % confidence interval")
+    coverage68_ci95: Ends
     coverage95: Share = key("Share of intervals of 1.96 σ that hold the truth")
-    coverage95_ci95: Interval = key("Its 95 % confidence interval")
+    coverage95_ci95: Ends
     pull_mean: Number = key("Mean of (estimate − truth)/σ")
     pull_std: Number = key("Its standard deviation, 1 where σ is right")
     posterior_coverage68: Number = maybe("Share of central 68 % intervals that hold the truth")
@@ -153,15 +155,11 @@ class Benchmark(Document):
     size: ModeStudy = maybe("Mode size, likewise; of spheres, which have this in place of mass")
     localize: ModeStudy = key("Mode localize, likewise")
     joint: ModeStudy = maybe("Mode joint, likewise; not of spheres")
-    estimators: dict[str, dict[str, Any]] = maybe(
-        "With --estimator: by name and mode, as the estimators of a challenge's part"
-    )
+    estimators: dict[str, dict[str, Any]] = maybe("With --estimator: by name and mode")
     ranking: list[Ranked] = maybe("With --estimator: best first")
     paired: dict[str, Any] = maybe("Ratios of mean square errors on the same counts, by mode")
     estimator_curves: dict[str, Any] = maybe("Errors of estimators against all that was varied")
-    estimator_map: dict[str, Any] = maybe(
-        "Who keeps most of the information, and who is as good, by height (rows) and photons"
-    )
+    estimator_map: dict[str, Any] = maybe("Who keeps most information, by height and photons")
     detection: dict[str, Any] = maybe("Recall of estimators against mass")
     curves: dict[str, Any] = maybe("Spread and bounds against photons and against height")
     histograms: dict[str, Any] = maybe("Pulls, and ranks of posteriors")
