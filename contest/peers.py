@@ -7,6 +7,7 @@ that its one file is loaded from a PiSCAT that was installed without its require
 
 from __future__ import annotations
 
+from functools import partial
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
@@ -20,22 +21,6 @@ Table = dict[str, FloatArray]
 
 TRACKPY_PX = 9
 """Diameter of trackpy's mask, odd [pixels]."""
-
-
-def picasso_gausslq(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Table:
-    """Fit by `picasso.fitting.gaussfit`, least squares.
-
-    Shapes: `before, after` (n, y, x).
-    """
-    return _picasso(before, after, setup, mle=False)
-
-
-def picasso_gaussmle(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Table:
-    """Fit by `picasso.fitting.gaussfit`, maximum likelihood.
-
-    Shapes: `before, after` (n, y, x).
-    """
-    return _picasso(before, after, setup, mle=True)
 
 
 def _picasso(before: FloatArray, after: FloatArray, setup: EstimatorSetup, *, mle: bool) -> Table:
@@ -54,6 +39,10 @@ def _picasso(before: FloatArray, after: FloatArray, setup: EstimatorSetup, *, ml
         "y_nm": (theta[:, 2] + corner[:, 0]) * pixel,
         "amplitude": setup.polarity * theta[:, 0],
     }
+
+
+picasso_gausslq, picasso_gaussmle = (partial(_picasso, mle=mle) for mle in (False, True))
+"""Fits by `picasso.fitting.gaussfit`: least squares, and maximum likelihood."""
 
 
 def piscat(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Table:

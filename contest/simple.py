@@ -33,6 +33,7 @@ LOST = {Status.NOT_CONVERGED, Status.AT_BOUND, Status.AMBIGUOUS_Z}
 _EVALUATIONS = 200
 
 Table = dict[str, FloatArray]
+Cut = tuple[slice, slice]
 
 
 def iscat(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> pd.DataFrame:
@@ -67,12 +68,11 @@ def gauss_ls(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Ta
     Shapes: `before, after` (n, y, x).
     """
     images = setup.image(before, after)
-    width = setup.psf_sigma_nm / setup.pixel_size_nm
 
-    def fit(i: int, cut: tuple[slice, slice], start_px: FloatArray) -> FloatArray:
-        return fit_gaussian(images[i][cut], cut, start_px, width, setup.polarity)
+    def residual(i: int, cut: Cut, model: FloatArray) -> FloatArray:
+        return model - images[i][cut]
 
-    return _fitted(images, setup, fit)
+    return _fitted(images, setup, residual, is_standard=False)
 
 
 def gauss_mle(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Table:
@@ -82,101 +82,51 @@ def gauss_mle(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> T
 
     Shapes: `before, after` (n, y, x).
     """
-    images = setup.image(before, after)
-    ratio = setup.n_after / max(setup.n_before, 1)
-    width = setup.psf_sigma_nm / setup.pixel_size_nm
+    background = np.maximum(before * (setup.n_after / max(setup.n_before, 1)), 1e-9)
+    unit = background if setup.interferes else np.full_like(background, setup.n_after)
 
-    def fit(i: int, cut: tuple[slice, slice], start_px: FloatArray) -> FloatArray:
-        expected = np.maximum(ratio * before[i][cut], 1e-9)
-        unit = expected if setup.interferes else np.full_like(expected, float(setup.n_after))
-        return fit_gaussian(
-            images[i][cut], cut, start_px, width, setup.polarity, counts=after[i][cut],
-            background=expected, unit=unit,
-        )  # fmt: skip
+    def residual(i: int, cut: Cut, model: FloatArray) -> FloatArray:
+        counts = after[i][cut]
+        mean = np.maximum(background[i][cut] + unit[i][cut] * model, 1e-9)
+        deviance = 2 * (mean - counts + counts * np.log(np.maximum(counts, 1e-12) / mean))
+        return np.sign(mean - counts) * np.sqrt(np.maximum(deviance, 0.0))
 
-    return _fitted(images, setup, fit)
+    return _fitted(setup.image(before, after), setup, residual, is_standard=True)
 
 
-def gaussian(x: FloatArray, y: FloatArray, p: FloatArray) -> FloatArray:
-    """Give a round Gaussian of amplitude, centre, width and level.
-
-    Shapes: `x` (nx,), `y` (ny,), `p` (5,), result (ny, nx).
-    """
-    return np.asarray(p[0] * _bell(x, y, p)[2] + p[4])
-
-
-def gaussian_slopes(x: FloatArray, y: FloatArray, p: FloatArray) -> FloatArray:
-    """Give its derivatives with respect to the five.
-
-    Shapes: as `gaussian`, result (ny, nx, 5).
-    """
-    u, v, g = _bell(x, y, p)
-    slope = p[0] * g / p[3]
-    return np.stack((g, slope * u, slope * v, slope * (u**2 + v**2), np.ones_like(g)), axis=-1)
-
-
-def _bell(x: FloatArray, y: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    u, v = (x - p[1]) / p[3], ((y - p[2]) / p[3])[:, None]
-    return u, v, np.exp(-(u**2 + v**2) / 2)
-
-
-def fit_gaussian(
-    image: FloatArray,
-    cut: tuple[slice, slice],
-    start_px: FloatArray,
-    sigma_px: float,
-    polarity: float,
+def _fitted(
+    images: FloatArray,
+    setup: EstimatorSetup,
+    residual: Callable[[int, Cut, FloatArray], FloatArray],
     *,
-    counts: FloatArray | None = None,
-    background: FloatArray | None = None,
-    unit: FloatArray | None = None,
-) -> FloatArray:
-    """Give amplitude, x and y [px], width [px] and level, and the standard deviation of each.
+    is_standard: bool,
+) -> Table:
+    """Fit a Gaussian to every region from its start; residuals may be in standard deviations."""
+    pixel, starts = setup.pixel_size_nm, setup.start[:, :2] / setup.pixel_size_nm
+    half = half_width(setup.optics, pixel)
 
-    Shapes: `image, counts, background, unit` (y, x), `start_px` (2,), result (2, 5).
-    """
-    y, x = (np.arange(part.start, part.stop, dtype=float) for part in cut)
-    scale = float(np.max(np.abs(image))) or 1.0
+    def fit(i: int) -> FloatArray:
+        cut = around(images.shape[1:], starts[i], half)
+        y, x = (np.arange(part.start, part.stop, dtype=float) for part in cut)
+        scale = float(np.max(np.abs(images[i][cut]))) or 1.0
 
-    def value(p: FloatArray) -> FloatArray:
-        return scale * gaussian(x, y, p)
+        def misfit(p: FloatArray) -> FloatArray:
+            u, v = (x - p[1]) / p[3], ((y - p[2]) / p[3])[:, None]
+            return residual(i, cut, scale * (p[0] * np.exp(-(u**2 + v**2) / 2) + p[4])).ravel()
 
-    def slopes(p: FloatArray) -> FloatArray:
-        return scale * gaussian_slopes(x, y, p)
+        begin = [0.8 * setup.polarity, *starts[i], setup.psf_sigma_nm / pixel, 0.0]
+        found = least_squares(misfit, begin, method="lm", max_nfev=_EVALUATIONS)
+        if not found.success or not np.all(np.isfinite(found.x)):
+            return np.full((2, 5), np.nan)
+        noise = 1.0 if is_standard else 2 * found.cost / max(found.fun.size - 5, 1)
+        variance = np.diag(np.linalg.pinv(found.jac.T @ found.jac)) * noise
+        to_image = np.array([scale, pixel, pixel, pixel, scale])
+        return np.array([found.x, np.sqrt(np.maximum(variance, 0.0))]) * to_image
 
-    if counts is None or background is None or unit is None:
-
-        def residual(p: FloatArray) -> FloatArray:
-            return ((value(p) - image) / scale).ravel()
-
-        def jacobian(p: FloatArray) -> FloatArray:
-            return (slopes(p) / scale).reshape(-1, 5)
-    else:
-        observed = np.maximum(counts, 1e-12)
-
-        def expected(p: FloatArray) -> FloatArray:
-            return np.maximum(background + unit * value(p), 1e-9)
-
-        def residual(p: FloatArray) -> FloatArray:
-            mean = expected(p)
-            deviance = 2 * (mean - counts + counts * np.log(observed / mean))
-            return (np.sign(mean - counts) * np.sqrt(np.maximum(deviance, 0.0))).ravel()
-
-        def jacobian(p: FloatArray) -> FloatArray:
-            mean, r = expected(p), residual(p).reshape(counts.shape)
-            near = np.abs(r) < 1e-6
-            steep = np.where(near, 1 / np.sqrt(mean), (1 - counts / mean) / np.where(near, 1, r))
-            return (slopes(p) * (steep * unit)[..., None]).reshape(-1, 5)
-
-    begin = np.array([polarity * 0.8, *start_px, sigma_px, 0.0])
-    found = least_squares(residual, begin, jacobian, method="lm", max_nfev=_EVALUATIONS)
-    if not found.success or not np.all(np.isfinite(found.x)):
-        return np.full((2, 5), np.nan)
-    information = found.jac.T @ found.jac
-    noise = 1.0 if counts is not None else 2 * found.cost / max(image.size - 5, 1)
-    sigma = np.sqrt(np.maximum(np.diag(np.linalg.pinv(information)) * noise, 0.0))
-    to_image = np.array([scale, 1.0, 1.0, 1.0, scale])
-    return np.array([found.x * to_image, sigma * to_image])
+    found = np.stack([fit(i) for i in range(len(images))])
+    names = ("amplitude", "x_nm", "y_nm")
+    values = {name: found[:, 0, k] for k, name in enumerate(names)}
+    return values | {f"sigma_{name}": found[:, 1, k] for k, name in enumerate(names)}
 
 
 def matched_filter(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Table:
@@ -240,7 +190,7 @@ def centroid(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Ta
             column = float(np.average(x[disc], weights=mass))
             row = float(np.average(y[disc], weights=mass))
             out[i] = column * pixel, row * pixel, setup.polarity * image[disc].sum()
-    return {"x_nm": out[:, 0], "y_nm": out[:, 1], "amplitude": out[:, 2]}
+    return _places(out)
 
 
 def radial_symmetry(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Table:
@@ -265,19 +215,11 @@ def radial_symmetry(before: FloatArray, after: FloatArray, setup: EstimatorSetup
         far = np.hypot(x - middle[0], y - middle[1])
         w = strength / np.maximum(far, 0.5) / np.maximum(strength, 1e-300)
         # distance of (a, b) from the line: (gy (x − a) − gx (y − b)) / |g|
-        matrix = np.array(
-            [
-                [np.sum(w * gy * gy), -np.sum(w * gx * gy)],
-                [-np.sum(w * gx * gy), np.sum(w * gx * gx)],
-            ]
-        )
-        aim = gy * x - gx * y
-        a, b = np.linalg.lstsq(
-            matrix, np.array([np.sum(w * gy * aim), -np.sum(w * gx * aim)]), rcond=None
-        )[0]
+        lines = np.sqrt(w) * np.array([gy, -gx, gy * x - gx * y])
+        a, b = np.linalg.lstsq(lines[:2].reshape(2, -1).T, lines[2].ravel(), rcond=None)[0]
         if 0 <= a < part.shape[1] and 0 <= b < part.shape[0]:
             out[i] = (a + cut[1].start) * pixel, (b + cut[0].start) * pixel
-    return {"x_nm": out[:, 0], "y_nm": out[:, 1]}
+    return _places(out)
 
 
 def half_width(optics: Optics, pixel_nm: float) -> int:
@@ -285,72 +227,40 @@ def half_width(optics: Optics, pixel_nm: float) -> int:
     return max(2, round(optics.wavelength_nm / optics.na / pixel_nm))
 
 
-def around(shape: tuple[int, ...], start_px: FloatArray, half: int) -> tuple[slice, slice]:
+def around(shape: tuple[int, ...], start_px: FloatArray, half: int) -> Cut:
     """Cut a square around a start, as much of it as lies in the image."""
-    rows, columns = shape
-    column, row = (round(float(v)) for v in start_px)
-    return (
-        slice(min(max(row - half, 0), rows - 1), min(max(row + half + 1, 1), rows)),
-        slice(min(max(column - half, 0), columns - 1), min(max(column + half + 1, 1), columns)),
-    )
-
-
-def _fitted(
-    images: FloatArray,
-    setup: EstimatorSetup,
-    fit: Callable[[int, tuple[slice, slice], FloatArray], FloatArray],
-) -> Table:
-    """Fit every region from its start."""
-    pixel = setup.pixel_size_nm
-    starts, half = setup.start[:, :2] / pixel, half_width(setup.optics, pixel)
-    found = np.stack(
-        [fit(i, around(images.shape[1:], start, half), start) for i, start in enumerate(starts)]
-    )
-    return {
-        "x_nm": found[:, 0, 1] * pixel,
-        "y_nm": found[:, 0, 2] * pixel,
-        "amplitude": found[:, 0, 0],
-        "sigma_x_nm": found[:, 1, 1] * pixel,
-        "sigma_y_nm": found[:, 1, 2] * pixel,
-        "sigma_amplitude": found[:, 1, 0],
-    }
+    corner = np.rint(start_px[::-1]).astype(int) - half
+    first = np.clip(corner, 0, np.array(shape) - 1)
+    last = np.clip(corner + 2 * half + 1, 1, shape)
+    return slice(first[0], last[0]), slice(first[1], last[1])
 
 
 def _highest(
     images: FloatArray, setup: EstimatorSetup, polarity: int, *, refined: bool = True
 ) -> Table:
-    """Find the maximum near each start."""
+    """Find the maximum near each start, between pixels by parabolas; NaN where none is known."""
     pixel = setup.pixel_size_nm
-    out = np.stack(
-        [
-            highest(image, start, polarity, refined=refined)
-            for image, start in zip(images, setup.start[:, :2] / pixel, strict=True)
-        ]
-    )
-    return {"x_nm": out[:, 0] * pixel, "y_nm": out[:, 1] * pixel, "amplitude": out[:, 2]}
-
-
-def highest(
-    image: FloatArray, start_px: FloatArray, polarity: float, *, refined: bool
-) -> FloatArray:
-    """Give column, row and height of the maximum near a start, between pixels by parabolas.
-
-    Shapes: `image` (ny, nx), `start_px` (2,), result (3,), NaN where no pixel is known.
-    """
-    turned: FloatArray = polarity * image
-    y, x = np.indices(image.shape)
-    near = (np.hypot(x - start_px[0], y - start_px[1]) <= REACH_PX) & np.isfinite(turned)
-    if not near.any():
-        return np.full(3, np.nan)
-    candidates = np.where(near, turned, -np.inf)
-    down, across = (int(k) for k in np.unravel_index(np.argmax(candidates), image.shape))
-    shift, top = [0.0, 0.0], float(turned[down, across])
-    lines = (turned[down], across), (turned[:, across], down)
-    for k, (line, at) in enumerate(lines if refined else ()):
-        if 0 < at < line.size - 1:
-            before, middle, behind = line[at - 1 : at + 2]
+    y, x = np.indices(images.shape[1:])
+    out = np.full((len(images), 3), np.nan)
+    for i, image in enumerate(polarity * images):
+        column, row = setup.start[i, :2] / pixel
+        near = (np.hypot(x - column, y - row) <= REACH_PX) & np.isfinite(image)
+        if not near.any():
+            continue
+        place = np.argmax(np.where(near, image, -np.inf))
+        down, across = (int(k) for k in np.unravel_index(place, image.shape))
+        shift, top = [0.0, 0.0], float(image[down, across])
+        lines = (image[down], across), (image[:, across], down)
+        for k, (line, at) in enumerate(lines if refined else ()):
+            before, middle, behind = line[at - 1 : at + 2] if 0 < at < line.size - 1 else (0, 0, 0)
             bend = before - 2 * middle + behind
             if bend < 0:
-                shift[k] = float((before - behind) / (2 * bend))
-                top -= float((before - behind) ** 2 / (8 * bend))
-    return np.array([across + shift[0], down + shift[1], polarity * top])
+                shift[k] = (before - behind) / (2 * bend)
+                top -= (before - behind) ** 2 / (8 * bend)
+        out[i] = (across + shift[0]) * pixel, (down + shift[1]) * pixel, polarity * top
+    return _places(out)
+
+
+def _places(found: FloatArray) -> Table:
+    """Name columns x [nm], y [nm] and, if there is a third, amplitude."""
+    return dict(zip(("x_nm", "y_nm", "amplitude"), found.T, strict=False))
