@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ContrastError
-from iscat_analysis.executors import Executor
 from iscat_analysis.records import PARAMETERS, FloatArray, Progress, silent
 from iscat_analysis.study import (
     OF_DIPOLES,
@@ -73,6 +73,22 @@ class Draws:
     truths: FloatArray
     limits: Limits
 
+    def scores(self, answer: Answer, seed: int) -> dict[str, dict[str, Any]]:
+        """Score an answer, parameter by parameter."""
+        weights = resamples(len(self.truths), seed)
+        return score_estimates(answer.columns, self.truths, self.limits, weights)
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """Counts at one place of a curve, or of the map, whose abscissa is the height."""
+
+    axis: str
+    value: float
+    draws: Draws
+    scores: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    answers: Mapping[str, Answer] = field(default_factory=dict)
+
 
 def draw(
     setting: Setting,
@@ -86,18 +102,12 @@ def draw(
 ) -> Draws:
     """Draw counts: of `source`, where estimators are told another microscope; among others."""
     true = source or setting
-    side_nm = true.pixels * true.context.pixel_nm
-    others = replace(true, context=replace(true.context, model=true.context.wide))
-    bounds = true.bounds.crb_joint
     pixel = setting.context.pixel_nm
-    most = [RANGE_PX * pixel, RANGE_PX * pixel, RANGE_Z_NM, RANGE_MASS * setting.truth[3]]
-    width = np.array(
-        [
-            min(RANGE_CRB * bounds[k], most[k]) if name in setting.free else 0.0
-            for k, name in enumerate(PARAMETERS)
-        ]
-    )
-    width = np.where(np.isfinite(width), width, np.array(most))
+    area_um2 = (true.pixels * true.context.pixel_nm / 1000) ** 2
+    others = replace(true, context=replace(true.context, model=true.context.wide))
+    most = np.array([RANGE_PX * pixel, RANGE_PX * pixel, RANGE_Z_NM, RANGE_MASS * setting.truth[3]])
+    width = np.fmin(RANGE_CRB * true.bounds.crb_joint, most)  # where there is no bound, the most
+    width[[name not in setting.free for name in PARAMETERS]] = 0.0
     low, high = setting.config.fit.z_range_nm
     width[2] = min(width[2], setting.truth[2] - low, high - setting.truth[2]) * (width[2] > 0)
     truths, starts = np.empty((2, count, 4))
@@ -108,10 +118,9 @@ def draw(
         start = setting.start(truths[i], random)
         starts[i] = start.x_px * pixel, start.y_px * pixel, start.z_nm, start.mass_kda
         frame = true.level_e() + (0.0 if empty else true.signal_e(truths[i]))
-        if density_um2:
-            for _ in range(random.poisson(density_um2 * (side_nm / 1000) ** 2)):
-                place = random.uniform(-0.5, true.pixels - 0.5, 2) * pixel
-                frame = frame + others.signal_e(np.array([*place, *truths[i, 2:]]))
+        for _ in range(random.poisson(density_um2 * area_um2) if density_um2 else 0):
+            place = random.uniform(-0.5, true.pixels - 0.5, 2) * pixel
+            frame = frame + others.signal_e(np.array([*place, *truths[i, 2:]]))
         counts = true.windows(np.broadcast_to(frame, (true.pixels, true.pixels)), random)
         before.append(counts.before_e)
         after.append(counts.after_e)
@@ -126,7 +135,6 @@ def compare_estimators(
     trials: int,
     seed: int,
     time_limit_s: float,
-    executor: Executor | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Let estimators see the same counts, and score them: ``estimators``, ``paired``, curves."""
@@ -142,70 +150,68 @@ def compare_estimators(
     ]
     rate = max(config.bounds.false_alarm_probability, FALSE_ALARMS / max(trials, 2 * FALSE_ALARMS))
     empty = draw(settings["mass"], trials, seed=seed, stream=1900, empty=True)
-    jobs = [*(d.job for d in tables.values()), *(d.job for _, _, d in points), empty.job]
-    answers = run_estimators(estimators, jobs, time_limit_s, executor, progress)
-    out: dict[str, Any] = {"estimators": {}, "estimator_curves": {}, "paired": {}}
-    for one in estimators:
-        out["estimators"][one.name] = _scores(tables, answers[one.name], seed)
-        out["estimators"][one.name]["about"] = one.about
-    for m, (k, drawn) in zip(tables, enumerate(tables.values()), strict=True):
+    jobs = [*(d.job for d in tables.values()), *(p.draws.job for p in points), empty.job]
+    answers = run_estimators(estimators, jobs, time_limit_s, progress)
+    scored: dict[str, Any] = {
+        one.name: {"about": one.about}
+        | {m: _scores(d, answers[one.name][k], seed) for k, (m, d) in enumerate(tables.items())}
+        for one in estimators
+    }
+    pairs = {}
+    for k, (m, drawn) in enumerate(tables.items()):
         columns = {name: given[k].columns for name, given in answers.items()}
-        scores = {name: entry[m] for name, entry in out["estimators"].items()}
+        scores = {name: entry[m] for name, entry in scored.items()}
         weights = resamples(trials, seed)
-        out["paired"][m] = beside_best(columns, scores, drawn.truths, drawn.limits, weights)
-    named = {name: given[len(tables) :] for name, given in answers.items()}
-    out["estimator_curves"] = {"mode": mode, "trials": fewer, **_curves(points, named, seed)}
-    out["estimator_map"] = {"mode": mode, "trials": fewer, **_map(points, named, seed)}
-    out["detection"] = _detection(points, named, settings["mass"], rate, seed)
-    return out
+        pairs[m] = beside_best(columns, scores, drawn.truths, drawn.limits, weights)
+    for k, point in enumerate(points):
+        given = {name: found[len(tables) + k] for name, found in answers.items()}
+        scores = {name: point.draws.scores(answer, seed) for name, answer in given.items()}
+        points[k] = replace(point, answers=given, scores=scores)
+    nothing = {name: found[-1] for name, found in answers.items()}
+    return {
+        "estimators": scored,
+        "estimator_curves": {"mode": mode, "trials": fewer, **_curves(points)},
+        "estimator_map": {"mode": mode, "trials": fewer, **_map(points, seed)},
+        "paired": pairs,
+        "detection": _detection(points, nothing, settings["mass"], rate, seed),
+    }
 
 
-def _scores(tables: Mapping[str, Draws], answers: Sequence[Answer], seed: int) -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for (mode, drawn), answer in zip(tables.items(), answers, strict=False):
-        count = len(drawn.truths)
-        weights = resamples(count, seed)
-        scored = score_estimates(answer.columns, drawn.truths, drawn.limits, weights)
-        out[mode] = {
-            **scored,
-            "trials": count,
-            "failed": sum(answer.failures.values()),
-            "failures": answer.failures,
-            "seconds_per_fit": answer.seconds / count,
-            "processor_seconds_per_fit": answer.processor_seconds / count,
-            "peak_mb": answer.peak_mb,
-        }
-    return out
+def _scores(drawn: Draws, answer: Answer, seed: int) -> dict[str, Any]:
+    count = len(drawn.truths)
+    return {
+        **drawn.scores(answer, seed),
+        "trials": count,
+        "failed": sum(answer.failures.values()),
+        "failures": answer.failures,
+        "seconds_per_fit": answer.seconds / count,
+        "processor_seconds_per_fit": answer.processor_seconds / count,
+        "peak_mb": answer.peak_mb,
+    }
 
-
-Point = tuple[str, float, Draws]
-"""Axis, abscissa, counts; of the map the height, with all photons one after the other."""
 
 MAP = "map"
 
 
 def _points(config: Config, setting: Setting, count: int, seed: int) -> list[Point]:
-    """Draw what the curves show: axis, abscissa, counts."""
+    """Draw what the curves show."""
     mode, optics = setting.mode, config.optics
     found: list[Point] = []
 
     def add(axis: str, value: float, one: Setting, **options: Any) -> None:
-        stream = 1100 + len(found)
-        found.append((axis, value, draw(one, count, seed=seed, stream=stream, **options)))
+        drawn = draw(one, count, seed=seed, stream=1100 + len(found), **options)
+        found.append(Point(axis, value, drawn))
 
     made = partial(make_setting, config, mode, context=setting.context)
-    faintest = made(collected=PHOTONS[0])
+    clear = float(made(collected=PHOTONS[0]).truth[2])
     for photons in PHOTONS:
-        z_nm = float(faintest.truth[2])
-        add("photons", photons, made(collected=photons, z_nm=z_nm))
+        add("photons", photons, made(collected=photons, z_nm=clear))
     mass = make_setting(config, "mass")
     per_kda = float(detection_snr(mass.experiment_in_region, mass.truth[3:])[0]) / mass.truth[3]
     for snr in SNRS if math.isfinite(per_kda) else ():
         kda = snr / per_kda
         add("mass", kda, replace(mass, truth=np.array([*mass.truth[:3], kda])))
-    low, high = config.fit.z_range_nm
-    for share in HEIGHTS:
-        z_nm = low + share * (high - low)
+    for z_nm in _heights(config):
         add("height", z_nm, made(z_nm=z_nm))
     for change in FOCI_NM:
         if (one := _refocused(config, mode, change)) is not None:
@@ -220,59 +226,53 @@ def _points(config: Config, setting: Setting, count: int, seed: int) -> list[Poi
 
 def _map_points(config: Config, setting: Setting, count: int, seed: int) -> list[Point]:
     """Draw what the map shows, row by row."""
+    made = partial(make_setting, config, setting.mode, context=setting.context)
+    places = enumerate(product(_heights(config), MAP_PHOTONS), 1500)
+    return [
+        Point(MAP, z, draw(made(collected=photons, z_nm=z), count, seed=seed, stream=stream))
+        for stream, (z, photons) in places
+    ]
+
+
+def _heights(config: Config) -> list[float]:
     low, high = config.fit.z_range_nm
-    found: list[Point] = []
-    for share in HEIGHTS:
-        z_nm = low + share * (high - low)
-        for photons in MAP_PHOTONS:
-            one = make_setting(
-                config, setting.mode, context=setting.context, collected=photons, z_nm=z_nm
-            )
-            drawn = draw(one, count, seed=seed, stream=1500 + len(found))
-            found.append((MAP, z_nm, drawn))
-    return found
+    return [low + share * (high - low) for share in HEIGHTS]
 
 
-def _map(
-    points: Sequence[Point], answers: Mapping[str, Sequence[Answer]], seed: int
-) -> dict[str, Any]:
+def _map(points: Sequence[Point], seed: int) -> dict[str, Any]:
     """Tell who keeps most of the information at each height and light, and who is as good.
 
     As good are those whose mean square error on the same counts is not larger, by its interval.
     """
-    cells = [(number, drawn) for number, (axis, _, drawn) in enumerate(points) if axis == MAP]
-    heights = [value for axis, value, _ in points if axis == MAP][:: len(MAP_PHOTONS)]
+    cells = [point for point in points if point.axis == MAP]
+    shape = len(cells) // len(MAP_PHOTONS), len(MAP_PHOTONS)
     out: dict[str, Any] = {}
-    for place, (number, drawn) in enumerate(cells):
-        weights, count = resamples(len(drawn.truths), seed), len(drawn.truths)
-        row, column = divmod(place, len(MAP_PHOTONS))
-        scored = {
-            who: score_estimates(given[number].columns, drawn.truths, drawn.limits, weights)
-            for who, given in answers.items()
-        }
-        for i, name in enumerate(drawn.limits.free):
-            table = out.setdefault(
-                name, {key: [[None] * len(MAP_PHOTONS) for _ in heights] for key in _CELL}
-            )
+    for (row, column), cell in zip(np.ndindex(shape), cells, strict=True):
+        limits, count = cell.draws.limits, len(cell.draws.truths)
+        for i, name in enumerate(limits.free):
+            empty = {key: [[None] * shape[1] for _ in range(shape[0])] for key in _CELL}
+            table = out.setdefault(name, empty)
             kept = {
                 who: one[name]["efficiency_crb"] * one[name]["answered"] / count
-                for who, one in scored.items()
+                for who, one in cell.scores.items()
                 if math.isfinite(one.get(name, {}).get("efficiency_crb", math.nan))
                 and not one[name]["below_bound"]
             }
             if not kept:
                 continue
             best = max(kept, key=lambda who: kept[who])
-            truth, crb = drawn.truths[:, PARAMETERS.index(name)], drawn.limits.crb[:, i]
-            errors = {who: answers[who][number].columns[name] - truth for who in kept}
+            truth = cell.draws.truths[:, PARAMETERS.index(name)]
+            errors = {who: cell.answers[who].columns[name] - truth for who in kept}
+            against = partial(paired, theirs=errors[best], crb=limits.crb[:, i])
+            weights = resamples(count, seed)
             equal = [
                 who
-                for who in kept
-                if who != best
-                and not paired(errors[who], errors[best], crb, weights)["mse_ratio_ci95"][0] > 1
+                for who, error in errors.items()
+                if who != best and not against(error, weights=weights)["mse_ratio_ci95"][0] > 1
             ]
             for key, value in zip(_CELL, (best, kept[best], equal), strict=True):
                 table[key][row][column] = value
+    heights = [cell.value for cell in cells[:: shape[1]]]
     return {"photons": list(MAP_PHOTONS), "height_nm": heights, "parameters": out}
 
 
@@ -288,57 +288,48 @@ def _refocused(config: Config, mode: str, change_nm: float) -> Setting | None:
         return None
 
 
-def _curves(
-    points: Sequence[Point], answers: Mapping[str, Sequence[Answer]], seed: int
-) -> dict[str, Any]:
+def _curves(points: Sequence[Point]) -> dict[str, Any]:
     """Tabulate error and bounds along each axis, for every parameter and estimator."""
+    nothing = {"rmse": math.nan, "rmse_ci95": (math.nan, math.nan), "efficiency_crb": math.nan}
     out: dict[str, Any] = {}
-    for number, (axis, value, drawn) in enumerate(points):
-        if axis == MAP:
-            continue
-        curve = out.setdefault(axis, {"at": [], "bounds": {}, "estimators": {}})
-        curve["at"].append(value)
-        for i, name in enumerate(drawn.limits.free):
-            bounds = curve["bounds"].setdefault(name, {"crb": [], "qcrb": [], "holevo": []})
-            bounds["crb"].append(float(np.sqrt(np.mean(drawn.limits.crb[:, i] ** 2))))
-            bounds["qcrb"].append(float(drawn.limits.qcrb[0, i]))
-            bounds["holevo"].append(float(drawn.limits.holevo[0, i]))
-        weights = resamples(len(drawn.truths), seed)
-        for who, given in answers.items():
-            scored = score_estimates(given[number].columns, drawn.truths, drawn.limits, weights)
-            lines = curve["estimators"].setdefault(who, {})
-            for name in drawn.limits.free:
-                line = lines.setdefault(
-                    name, {"rmse": [], "rmse_ci95": [], "efficiency_crb": [], "failed": []}
-                )
-                entry = scored.get(name, {})
-                line["rmse"].append(entry.get("rmse", math.nan))
-                line["rmse_ci95"].append(entry.get("rmse_ci95", (math.nan, math.nan)))
-                line["efficiency_crb"].append(entry.get("efficiency_crb", math.nan))
-                line["failed"].append(entry.get("failed", len(drawn.truths)))
+    for point in (point for point in points if point.axis != MAP):
+        limits = point.draws.limits
+        curve = out.setdefault(point.axis, {"at": [], "bounds": {}, "estimators": {}})
+        curve["at"].append(point.value)
+        for i, name in enumerate(limits.free):
+            crb = float(np.sqrt(np.mean(limits.crb[:, i] ** 2)))
+            qcrb, holevo = float(limits.qcrb[0, i]), float(limits.holevo[0, i])
+            _append(curve["bounds"], name, {"crb": crb, "qcrb": qcrb, "holevo": holevo})
+            for who, scored in point.scores.items():
+                entry = {**nothing, "failed": len(point.draws.truths), **scored.get(name, {})}
+                line = {key: entry[key] for key in (*nothing, "failed")}
+                _append(curve["estimators"].setdefault(who, {}), name, line)
     return out
 
 
+def _append(lines: dict[str, Any], name: str, values: Mapping[str, Any]) -> None:
+    """Add a point to the lines of a parameter."""
+    for key, value in values.items():
+        lines.setdefault(name, {}).setdefault(key, []).append(value)
+
+
 def _detection(
-    points: Sequence[Point],
-    answers: Mapping[str, Sequence[Answer]],
-    setting: Setting,
-    rate: float,
-    seed: int,
+    points: Sequence[Point], nothing: Mapping[str, Answer], setting: Setting, rate: float, seed: int
 ) -> dict[str, Any]:
-    """Tabulate recall against mass, for every estimator that gives a mass."""
-    masses = [(k, value) for k, (axis, value, _) in enumerate(points) if axis == "mass"]
-    known = np.array([value for _, value in masses])
+    """Tabulate recall against mass, for every estimator that gives a mass.
+
+    `nothing` has the answers to empty regions.
+    """
+    masses = [point for point in points if point.axis == "mass"]
+    known = np.array([point.value for point in masses])
     snr = detection_snr(setting.experiment_in_region, known)
     found: dict[str, Any] = {}
-    for who, given in answers.items():
-        nothing = given[-1].columns.get("mass_kda")
-        if nothing is None or not np.isfinite(nothing).any():
+    for who, answer in nothing.items():
+        empty = answer.columns.get("mass_kda", np.zeros(0))
+        if not np.isfinite(empty).any():
             continue
-        recalls = [
-            recall_at(nothing, given[k].columns.get("mass_kda", np.zeros(1)), rate, seed)
-            for k, _ in masses
-        ]
+        signals = [point.answers[who].columns.get("mass_kda", np.zeros(1)) for point in masses]
+        recalls = [recall_at(empty, signal, rate, seed) for signal in signals]
         found[who] = {key: [one[key] for one in recalls] for key in ("recall", "recall_ci95")}
     return {
         "false_alarm_rate": rate,

@@ -19,9 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis.executors import Executor
 from iscat_analysis.reading import first_line
-from iscat_analysis.records import FloatArray, Progress, silent
+from iscat_analysis.records import FloatArray, Progress
 from iscat_analysis.study import EstimatorSetup, Setting, setup_of
 from iscat_contest.estimators import Estimate, Estimator, checked_table
 
@@ -78,20 +77,14 @@ class Answer:
 
 
 def run_estimator(
-    estimator: Estimator,
-    jobs: Sequence[Job],
-    limit_s: float,
-    paths: Sequence[str] = (),
-    progress: Progress = silent,
+    estimator: Estimator, jobs: Sequence[Job], limit_s: float, paths: Sequence[str] = ()
 ) -> list[Answer]:
     """Let an estimator do jobs in a process of its own, within a time for all of them.
 
     What it did not answer is counted as failed, with the reason.
     """
-    del progress
     with tempfile.TemporaryDirectory(prefix="estimator-") as name:
-        request, answers = Path(name) / "request", Path(name) / "answers"
-        said = Path(name) / "said"
+        request, answers, said = (Path(name) / part for part in ("request", "answers", "said"))
         request.write_bytes(pickle.dumps((estimator, list(jobs), [*paths])))
         answers.touch()
         command = [sys.executable, "-m", __name__, str(request), str(answers)]
@@ -112,22 +105,13 @@ def run_estimator(
 
 
 def run_estimators(
-    estimators: Sequence[Estimator],
-    jobs: Sequence[Job],
-    limit_s: float,
-    executor: Executor | None,
-    progress: Progress,
+    estimators: Sequence[Estimator], jobs: Sequence[Job], limit_s: float, progress: Progress
 ) -> dict[str, list[Answer]]:
-    """Give all estimators the same jobs; their answers, by name."""
-    place = executor or Executor()
-    paths = [path for path in sys.path if path]
-
-    def work(estimator: Estimator) -> list[Answer]:
-        return place.call(run_estimator, estimator, jobs, limit_s, paths)
-
+    """Give all estimators the same jobs, one after the other; their answers, by name."""
     answers: dict[str, list[Answer]] = {}
-    for done, (number, found) in enumerate(place.each(work, list(estimators)), 1):
-        answers[estimators[number].name] = found
+    for done, estimator in enumerate(estimators, 1):
+        paths = [path for path in sys.path if path]
+        answers[estimator.name] = run_estimator(estimator, jobs, limit_s, paths)
         progress("estimators", done, len(estimators))
     return answers
 
@@ -149,17 +133,14 @@ def answer(estimate: Estimate, job: Job) -> Answer:
     except Exception:
         columns = _one_by_one(estimate, job, failures)
     clock, processor = time.perf_counter() - clock, time.process_time() - processor
-    for sigma in ("", "sigma_"):
-        amplitude = columns.pop(f"{sigma}amplitude", None)
-        if amplitude is not None and f"{sigma}mass_kda" not in columns:
-            columns[f"{sigma}mass_kda"] = (abs(factor) if sigma else factor) * amplitude
-    raised = sum(failures.values())
-    given = np.zeros(count, dtype=bool)
-    for name, values in columns.items():
-        if not name.startswith("sigma_"):
-            given |= np.isfinite(values)
-    if silent_rows := count - int(given.sum()) - raised:
-        failures["no number"] = silent_rows
+    for prefix, scale in (("", factor), ("sigma_", abs(factor))):
+        amplitude = columns.pop(f"{prefix}amplitude", None)
+        if amplitude is not None:
+            columns.setdefault(f"{prefix}mass_kda", scale * amplitude)
+    values = [v for name, v in columns.items() if not name.startswith("sigma_")]
+    answered = int(np.isfinite(values).any(axis=0).sum()) if values else 0
+    if unanswered := count - answered - sum(failures.values()):
+        failures["no number"] = unanswered
     return Answer(columns, failures, clock, processor, _peak_mb())
 
 
@@ -168,11 +149,9 @@ def _one_by_one(estimate: Estimate, job: Job, failures: dict[str, int]) -> dict[
     count = len(job.before)
     columns: dict[str, FloatArray] = {}
     for i in range(count):
-        part = slice(i, i + 1)
+        before, after = job.before[i : i + 1], job.after[i : i + 1]
         try:
-            row = checked_table(
-                estimate(job.before[part], job.after[part], job.setup.of(i, i + 1)), 1
-            )
+            row = checked_table(estimate(before, after, job.setup.of(i, i + 1)), 1)
         except Exception as error:
             why = f"{type(error).__name__}: {first_line(error)}"
             failures[why] = failures.get(why, 0) + 1

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from iscat_analysis.bounds import paper
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.executors import Executor, versions
+from iscat_analysis.executors import versions
 from iscat_analysis.hashing import sha256_of_files
 from iscat_analysis.movie import open_stack
 from iscat_analysis.reading import is_folder
@@ -56,114 +56,113 @@ SHORTER = 10
 """Percent of landings whose frames do not suffice for the window, about."""
 
 
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Parts of one kind: what is known of them, their particles, and bounds with all frames."""
+
+    about: Mapping[str, Any]
+    told: Config
+    events: pd.DataFrame
+    limits: Limits
+
+    @property
+    def pixel_nm(self) -> float:
+        """Side of a pixel [nm]."""
+        return float(self.about["pixel_size_nm"])
+
+    @property
+    def are_stacks(self) -> bool:
+        """Whether each file holds one particle."""
+        return bool(self.about["kind"] == "stacks")
+
+    @property
+    def truths(self) -> FloatArray:
+        """Parameters of the particles, shape (n, 4)."""
+        return self.events[list(PARAMETERS)].to_numpy(dtype=float)
+
+
 def score_challenge(
     challenge: Challenge,
     results: Sequence[Path],
     estimators: Sequence[Estimator] = (),
     *,
     time_limit_s: float = 600.0,
-    executor: Executor | None = None,
     command: str = "",
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Score results and estimators, part by part."""
-    groups = _groups(challenge)
-    pixel = {
-        group: float(challenge.manifest["parts"][parts[0]]["pixel_size_nm"])
-        for group, parts in groups.items()
-    }
     if len({path.name for path in results}) < len(results):
         raise DataError("two results have the same name, by which they are told apart; rename one")
-    out: dict[str, Any] = {}
+    groups, manifest = _groups(challenge), challenge.manifest
     hashes = {path.name: _sha256(path) for path in results}
-    known = {group: _truth_of(challenge, parts) for group, parts in groups.items()}
-    answers = _answers(challenge, groups, known, estimators, time_limit_s, executor, progress)
+    cuts = [_job(challenge, group) for group in groups.values()] if estimators else []
+    answers = run_estimators(estimators, [cut.job for cut in cuts], time_limit_s, progress)
+    parts: dict[str, Any] = {}
     used: set[str] = set()
-    for group, parts in groups.items():
-        about = challenge.manifest["parts"][parts[0]]
-        events, limits = known[group]
+    for number, (name, group) in enumerate(groups.items()):
         entries: dict[str, Any] = {}
         columns: dict[str, dict[str, FloatArray]] = {}
-        for read, names in _participants(results, pixel[group], events):
-            entry, found = _of_results(read, about, events, limits, challenge.told(parts[0]))
-            if entry is not None:
+        for read, names in _participants(results, group):
+            if (found := _of_results(read, group)) is not None:
                 used |= names
-                entries[read.name], columns[read.name] = entry, found
-        for estimator in estimators:
-            answer = answers[estimator.name][group]
-            entry = _entry(answer.columns, events, limits)
-            entries[estimator.name] = entry | {
-                "failures": answer.failures,
-                "about": estimator.about,
-            }
-            columns[estimator.name] = answer.columns
-        out[group] = {
-            "kind": about["kind"],
-            "mode": about["mode"],
-            "about": about["about"],
-            "trials": len(events),
-            "collected": float(np.mean(limits.collected)),
-            "mass_kda": float(events["mass_kda"].mean()),
-            "bounds": _bounds(limits),
-            "estimators": entries,
-            "paired": beside_best(
-                columns,
-                entries,
-                events[list(PARAMETERS)].to_numpy(dtype=float),
-                limits,
-                resamples(len(events), SEED),
-            ),
-        }
+                entries[read.name], columns[read.name] = found
+        for one in estimators:
+            answer = cuts[number].whole(answers[one.name][number])
+            entry = _entry(answer.columns, group.truths, group.limits)
+            entries[one.name] = {**entry, "failures": answer.failures, "about": one.about}
+            columns[one.name] = answer.columns
+        about = {key: group.about[key] for key in ("kind", "mode", "about")}
+        parts[name] = about | _part(group.truths, group.limits, entries)
+        weights = resamples(len(group.truths), SEED)
+        paired = beside_best(columns, entries, group.truths, group.limits, weights)
+        parts[name]["paired"] = paired
     lost = [path.name for path in results if path.name not in used]
     if lost:
         raise DataError(
             f"{lost[0]}: no row of it is of a file of this challenge; its column file has to name "
             "them, or the table has to be called as the movie is"
         )
-    manifest = challenge.manifest
-    document = {
-        "title": f"Challenge {manifest['name']}",
-        "challenge": {
-            "name": manifest["name"],
-            "version": manifest["version"],
-            "blind": manifest["blind"],
-            "made_by": manifest["made_by"],
-            "manifest_sha256": manifest_sha256(challenge.folder),
-            "truth_sha256": manifest["truth_sha256"],
-        },
+    about = {key: manifest[key] for key in ("name", "version", "blind", "made_by", "truth_sha256")}
+    about["manifest_sha256"] = manifest_sha256(challenge.folder)
+    document = _document(f"Challenge {manifest['name']}", about, hashes, parts, command)
+    return document | ({"table_1": table_1(parts)} if manifest["name"] == "dong2021" else {})
+
+
+def _document(
+    title: str,
+    about: Mapping[str, Any] | None,
+    hashes: Mapping[str, str],
+    parts: Mapping[str, Any],
+    command: str,
+) -> dict[str, Any]:
+    return {
+        "title": title,
+        "challenge": about,
         "results_sha256": hashes,
-        "parts": out,
-        "ranking": ranking(out),
+        "parts": parts,
+        "ranking": ranking(parts),
         "seed": SEED,
         "command": command,
         "versions": versions(),
     }
-    if manifest["name"] == "dong2021":
-        document["table_1"] = table_1(out)
-    return document
 
 
-def score_tables(
-    columns: Mapping[str, FloatArray], truths: FloatArray, limits: Limits, name: str, config: Config
-) -> dict[str, Any]:
-    """Score one table of one's own simulation, as a challenge of one part.
+def _part(truths: FloatArray, limits: Limits, entries: Mapping[str, Any]) -> dict[str, Any]:
+    def rms(values: FloatArray) -> float:
+        return float(np.sqrt(np.mean(values**2)))
 
-    Shapes: `columns` (n,) each, `truths` (n, 4).
-    """
-    events = pd.DataFrame(truths, columns=list(PARAMETERS))
-    entry = _entry(columns, events, limits)
-    part = {
-        "kind": "table",
-        "mode": config.fit.mode,
-        "about": "",
+    kinds = {"crb": limits.crb, "qcrb": limits.qcrb, "holevo": limits.holevo}
+    return {
         "trials": len(truths),
         "collected": float(np.mean(limits.collected)),
         "mass_kda": float(truths[:, 3].mean()),
-        "bounds": _bounds(limits),
-        "estimators": {name: entry},
+        "bounds": {
+            name: {kind: rms(values[:, i]) for kind, values in kinds.items()}
+            for i, name in enumerate(limits.free)
+        },
+        "estimators": entries,
         "paired": {},
     }
-    return {"parts": {"results": part}, "ranking": ranking({"results": part}), "seed": SEED}
 
 
 def ranking(parts: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -208,14 +207,12 @@ def table_1(parts: Mapping[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def _participants(
-    results: Sequence[Path], pixel_nm: float, events: pd.DataFrame
-) -> list[tuple[Results, set[str]]]:
+def _participants(results: Sequence[Path], group: _Group) -> list[tuple[Results, set[str]]]:
     """Read tables; those that are called as movies are, one for each, are one participant's."""
-    movies = {stem(file) for file in events["file"]}
+    movies = {stem(file) for file in group.events["file"]}
     out, own = [], []
     for path in results:
-        read = read_results(path, pixel_nm)
+        read = read_results(path, group.pixel_nm)
         if read.name in movies and "file" not in read.table:
             own.append((replace(read, table=read.table.assign(file=read.name)), path))
         else:
@@ -228,147 +225,91 @@ def _participants(
     return out
 
 
-def _groups(challenge: Challenge) -> dict[str, list[str]]:
-    """Put movies of one kind together."""
-    out: dict[str, list[str]] = {}
+def _groups(challenge: Challenge) -> dict[str, _Group]:
+    """Put movies of one kind together, and compute their bounds."""
+    names: dict[str, list[str]] = {}
     for name in challenge.manifest["parts"]:
-        out.setdefault(re.sub(r"_\d+$", "", name), []).append(name)
+        names.setdefault(re.sub(r"_\d+$", "", name), []).append(name)
+    out = {}
+    for group, parts in names.items():
+        about = challenge.manifest["parts"][parts[0]]
+        events = pd.DataFrame([one for part in parts for one in challenge.events(part)])
+        config, frames = challenge.true(parts[0]), None
+        side = config.fit.roi_px(float(about["pixel_size_nm"]))
+        changes: dict[str, Any] = {"pixels": side, "x_nm": 0.0, "y_nm": 0.0}
+        if about["kind"] == "movie":
+            end = events["leave"].fillna(about["frames"]).astype(int)
+            frames = [(int(a), int(b - a)) for a, b in zip(events["frame"], end, strict=True)]
+            changes["photons_per_pixel"] = config.simulation.photons_per_pixel
+        config = config.model_copy(update={"bounds": config.bounds.model_copy(update=changes)})
+        truths = events[list(PARAMETERS)].to_numpy(dtype=float)
+        limits = limits_of_many(config, FREE_PARAMETERS[about["mode"]], truths, frames)
+        out[group] = _Group(about, challenge.told(parts[0]), events, limits)
     return out
 
 
-def _truth_of(challenge: Challenge, parts: Sequence[str]) -> tuple[pd.DataFrame, Limits]:
-    """Give the events of parts of one kind, and their bounds with every frame that there is."""
-    events = pd.DataFrame([one for part in parts for one in challenge.events(part)])
-    config, about = challenge.true(parts[0]), challenge.manifest["parts"][parts[0]]
-    frames = None
-    side = config.fit.roi_px(float(about["pixel_size_nm"]))
-    changes: dict[str, Any] = {"pixels": side, "x_nm": 0.0, "y_nm": 0.0}
-    if about["kind"] == "movie":
-        end = events["leave"].fillna(about["frames"]).astype(int)
-        frames = [(int(a), int(b - a)) for a, b in zip(events["frame"], end, strict=True)]
-        changes["photons_per_pixel"] = config.simulation.photons_per_pixel
-    config = config.model_copy(update={"bounds": config.bounds.model_copy(update=changes)})
-    free = FREE_PARAMETERS[about["mode"]]
-    truths = events[list(PARAMETERS)].to_numpy(dtype=float)
-    return events, limits_of_many(config, free, truths, frames)
-
-
 def _of_results(
-    read: Results, about: Mapping[str, Any], events: pd.DataFrame, limits: Limits, told: Config
-) -> tuple[dict[str, Any] | None, dict[str, FloatArray]]:
-    """Match one table with one part and score it; nothing where no row is of it."""
-    pixel = float(about["pixel_size_nm"])
+    read: Results, group: _Group
+) -> tuple[dict[str, Any], dict[str, FloatArray]] | None:
+    """Match one table with one group and score it; nothing where no row is of it."""
     extra: dict[str, Any] = {}
-    if about["kind"] == "stacks":
-        if "file" not in read.table and "event" not in read.table:
-            return None, {}
-        placed = match_stacks(read, events, pixel)
-        if placed.notna().sum().sum() == 0:
-            return None, {}
-    elif "file" not in read.table and "frame" not in read.table:
-        return None, {}  # numbers of stacks
+    if not {"file", "event" if group.are_stacks else "frame"} & set(read.table):
+        return None
+    if group.are_stacks:
+        placed = match_stacks(read, group.events, group.pixel_nm)
+        rest = placed.iloc[:0]
     else:
-        files = list(dict.fromkeys(events["file"]))
-        matched, alarms = [], []
-        for file in files:
-            mine = events[events["file"] == file].reset_index(drop=True)
-            one, rest = match_movie(read, mine, file, len(files), pixel)
-            matched.append(one)
-            alarms.append(rest)
-        placed, false = pd.concat(matched, ignore_index=True), pd.concat(alarms, ignore_index=True)
-        if not len(false) and not placed.notna().any(axis=None):
-            return None, {}
-        rate = told.detection.false_alarms_per_movie
-        extra = _recall(placed, false, events, limits, rate, len(files))
+        files = group.events.groupby("file", sort=False)
+        matched = [
+            match_movie(read, mine.reset_index(drop=True), str(file), len(files), group.pixel_nm)
+            for file, mine in files
+        ]
+        placed, rest = (pd.concat(part, ignore_index=True) for part in zip(*matched, strict=True))
+        extra = _recall(placed, rest, group, len(files))
+    if not len(rest) and not placed.notna().any(axis=None):
+        return None
     notes = list(read.notes)
     columns = {
         str(name): placed[name].to_numpy(dtype=float)
         for name in placed
         if str(name).removeprefix("sigma_") in (*PARAMETERS, "amplitude")
     }
+    amplitude = columns.pop("amplitude", None)
     if "mass_kda" in columns:
         columns["mass_kda"] = np.abs(columns["mass_kda"])  # one that leaves has a negative mass
-    elif "amplitude" in columns:
-        truth = events["mass_kda"].to_numpy(dtype=float)
+    elif amplitude is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
-            factor = float(np.nanmedian(truth / columns["amplitude"]))
-        columns["mass_kda"] = factor * columns["amplitude"]
+            factor = float(np.nanmedian(group.truths[:, 3] / amplitude))
+        columns["mass_kda"] = factor * amplitude
         notes.append(f"masses are amplitudes × {factor:.6g}, the median of truth over amplitude")
-    columns.pop("amplitude", None)
-    return _entry(columns, events, limits) | extra | {"notes": notes}, columns
+    return _entry(columns, group.truths, group.limits) | extra | {"notes": notes}, columns
 
 
-def _entry(
-    columns: Mapping[str, FloatArray], events: pd.DataFrame, limits: Limits
-) -> dict[str, Any]:
-    truths = events[list(PARAMETERS)].to_numpy(dtype=float)
+def _entry(columns: Mapping[str, FloatArray], truths: FloatArray, limits: Limits) -> dict[str, Any]:
     scored = score_estimates(columns, truths, limits, resamples(len(truths), SEED))
     answered = max((one["answered"] for one in scored.values()), default=0)
     return {**scored, "trials": len(truths), "failed": len(truths) - answered}
 
 
-def _recall(
-    placed: pd.DataFrame,
-    false: pd.DataFrame,
-    events: pd.DataFrame,
-    limits: Limits,
-    rate: float,
-    movies: int,
-) -> dict[str, Any]:
+def _recall(placed: pd.DataFrame, rest: pd.DataFrame, group: _Group, movies: int) -> dict[str, Any]:
     """Tell what was found of each mass, above as many false alarms as are allowed."""
+    rate = group.told.detection.false_alarms_per_movie
     key = next((k for k in ("score", "mass_kda", "amplitude") if k in placed), None)
     found = placed.notna().any(axis=1).to_numpy()
     above = found.copy()
-    if key is not None and len(false):
-        rivals = np.sort(np.abs(false[key].to_numpy(dtype=float)))[::-1]
-        allowed = math.floor(rate * movies)
-        if allowed < rivals.size:
-            above &= np.abs(placed[key].to_numpy(dtype=float)) > rivals[allowed]
+    allowed = math.floor(rate * movies)
+    if key is not None and allowed < len(rest):
+        rivals = np.sort(np.abs(rest[key].to_numpy(dtype=float)))[::-1]
+        above &= np.abs(placed[key].to_numpy(dtype=float)) > rivals[allowed]
     table = []
-    mass = events["mass_kda"].to_numpy(dtype=float)
-    for value in np.unique(mass):
-        kind = mass == value
-        weights = resamples(int(kind.sum()), SEED)
-        share, interval = mean_interval(above[kind], weights)
-        table.append({
-            "mass_kda": float(value), "events": int(kind.sum()),
-            "found": int(found[kind].sum()), "recall": share, "recall_ci95": interval,
-            "matched_filter": float(np.mean([power_bound(s, rate) for s in limits.snr[kind]])),
-        })  # fmt: skip
-    return {"false_alarms": len(false), "false_alarms_per_movie": rate, "recall": table}
-
-
-def _bounds(limits: Limits) -> dict[str, dict[str, float]]:
-    def rms(values: FloatArray) -> float:
-        return float(np.sqrt(np.mean(values**2)))
-
-    return {
-        name: {"crb": rms(limits.crb[:, i]), "qcrb": rms(limits.qcrb[:, i]),
-               "holevo": rms(limits.holevo[:, i])}
-        for i, name in enumerate(limits.free)
-    }  # fmt: skip
-
-
-def _answers(
-    challenge: Challenge,
-    groups: Mapping[str, Sequence[str]],
-    known: Mapping[str, tuple[pd.DataFrame, Limits]],
-    estimators: Sequence[Estimator],
-    limit_s: float,
-    executor: Executor | None,
-    progress: Progress,
-) -> dict[str, dict[str, Answer]]:
-    """Run estimators on all parts, each in one process."""
-    if not estimators:
-        return {}
-    cut = [_job(challenge, parts, known[group][0]) for group, parts in groups.items()]
-    jobs = [one.job for one in cut]
-    found = run_estimators(estimators, jobs, limit_s, executor, progress)
-    out = {}
-    for name, answers in found.items():
-        whole = [one.whole(answer) for one, answer in zip(cut, answers, strict=True)]
-        out[name] = dict(zip(groups, whole, strict=True))
-    return out
+    for value in np.unique(group.truths[:, 3]):
+        kind = group.truths[:, 3] == value
+        share, interval = mean_interval(above[kind], resamples(int(kind.sum()), SEED))
+        best = [power_bound(s, rate) for s in group.limits.snr[kind]]
+        counts = {"events": int(kind.sum()), "found": int(found[kind].sum())}
+        recall = {"recall": share, "recall_ci95": interval, "matched_filter": float(np.mean(best))}
+        table.append({"mass_kda": float(value), **counts, **recall})
+    return {"false_alarms": len(rest), "false_alarms_per_movie": rate, "recall": table}
 
 
 @dataclass(frozen=True, eq=False)
@@ -393,27 +334,28 @@ class _Cut:
         return replace(answer, columns=columns, failures=answer.failures | short)
 
 
-def _job(challenge: Challenge, parts: Sequence[str], events: pd.DataFrame) -> _Cut:
+def _job(challenge: Challenge, group: _Group) -> _Cut:
     """Sum the counts of every event before and after, as an estimator is given them."""
-    about, told = challenge.manifest["parts"][parts[0]], challenge.told(parts[0])
+    about, told, events, pixel = group.about, group.told, group.events, group.pixel_nm
     camera = told.camera.assumed
     gain, offset = float(camera.gain_e_per_adu), float(camera.offset_adu)
-    side = told.fit.roi_px(float(about["pixel_size_nm"]))
-    stacks = about["kind"] == "stacks"
-    room = _room(events, about)
-    window = max(1, min(WINDOW, int(np.percentile(room, SHORTER))))
-    n_before, n_after = (about["n_before"], about["n_after"]) if stacks else (window, window)
+    side = told.fit.roi_px(pixel)
+    if group.are_stacks:
+        room = np.full(len(events), about["n_after"])
+        n_before, n_after = about["n_before"], about["n_after"]
+    else:  # frames that are there both before an event and with its particle
+        end = events["leave"].fillna(about["frames"])
+        room = np.minimum(events["frame"], end - events["frame"]).to_numpy(dtype=int)
+        n_before = n_after = max(1, min(WINDOW, int(np.percentile(room, SHORTER))))
     sums: FloatArray = np.full((2, len(events), side, side), np.nan)
     corners, starts = np.zeros((len(events), 2)), np.empty((len(events), 4))
-    truths = events[list(PARAMETERS)].to_numpy(dtype=float)
-    pixel = float(about["pixel_size_nm"])
+    truths = group.truths
     for file, mine in events.groupby("file", sort=False):
         with open_stack(challenge.folder / str(file)) as stack:
-            for i, event in zip(mine.index, mine.to_dict("records"), strict=True):
+            for i, first in mine["frame"].items():
                 random = trial_generator(SEED, 3000, int(i))
                 place = np.rint(truths[i, 1::-1] / pixel + random.uniform(-1, 1, 2)).astype(int)
                 corner = np.clip(place - side // 2, 0, np.array(stack.shape[1:]) - side)
-                first = int(event["frame"])
                 if room[i] < n_after:
                     continue
                 rows, columns = (slice(c, c + side) for c in corner)
@@ -422,12 +364,11 @@ def _job(challenge: Challenge, parts: Sequence[str], events: pd.DataFrame) -> _C
                         part = np.asarray(stack.read(a, b), dtype=float)[:, rows, columns]
                         sums[k, i] = ((part - offset) * gain).sum(axis=0)
                 corners[i] = corner
-                middle = np.full(2, (side - 1) / 2) if stacks else (place - corner).astype(float)
+                middle = np.full(2, (side - 1) / 2) if group.are_stacks else place - corner
                 starts[i, :2] = middle[::-1] * pixel
     photons = about.get("photons_per_pixel") or float(np.nanmean(sums[0]) / n_before)
     if not n_before:
-        dark = not told.optics.interferes
-        sums[0] = (told.background.level_e or 0.0) if dark else photons
+        sums[0] = photons if told.optics.interferes else told.background.level_e or 0.0
     changes = {"n_before": n_before, "n_after": n_after, "photons_per_pixel": photons}
     told = told.model_copy(update={"bounds": told.bounds.model_copy(update=changes)})
     setting = make_setting(told, about["mode"])
@@ -436,18 +377,6 @@ def _job(challenge: Challenge, parts: Sequence[str], events: pd.DataFrame) -> _C
     whole = np.flatnonzero(np.isfinite(sums).all(axis=(0, 2, 3)))
     job = job_of(setting, sums[0, whole], sums[1, whole], starts[whole])
     return _Cut(job, corners[whole] * pixel, whole, len(events), n_after)
-
-
-def _room(events: pd.DataFrame, about: Mapping[str, Any]) -> NDArray[np.int64]:
-    """Count the frames that are there both before an event and with its particle.
-
-    Shapes: result (n,).
-    """
-    if about["kind"] == "stacks":
-        return np.full(len(events), about["n_after"])
-    end = events["leave"].fillna(about["frames"]).to_numpy(dtype=np.int64)
-    first = events["frame"].to_numpy(dtype=np.int64)
-    return np.asarray(np.minimum(first, end - first), dtype=np.int64)
 
 
 def _sha256(path: Path) -> str:
@@ -475,13 +404,9 @@ def score_own(truth: Path, results: Path, config: Config, *, command: str = "") 
     if not columns:
         raise DataError(f"{results}: has none of the columns {', '.join(free)}")
     limits = limits_of_many(config, free, np.asarray(truths))
-    scored = score_tables(columns, truths, limits, found.name, config)
+    entries = {found.name: _entry(columns, truths, limits)}
+    part = {"kind": "table", "mode": config.fit.mode, "about": ""}
+    part |= _part(truths, limits, entries)
     hashes = {path.name: sha256_of_files([path]) for path in (truth, results)}
-    return {
-        "title": "Estimates of one's own simulation",
-        "challenge": None,
-        "results_sha256": hashes,
-        "command": command,
-        "versions": versions(),
-        **scored,
-    }
+    title = "Estimates of one's own simulation"
+    return _document(title, None, hashes, {"results": part}, command)
