@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 import tifffile
 
 from iscat_analysis.bounds import paper
@@ -52,11 +53,12 @@ class Challenge:
 
     def told(self, part: str) -> Config:
         """Give what participants know of a part."""
-        return _config_of((self.folder / "config" / f"{part}.toml").read_text(encoding="utf-8"))
+        text = (self.folder / "config" / f"{part}.toml").read_text(encoding="utf-8")
+        return parse_config(toml_of(text))
 
     def true(self, part: str) -> Config:
         """Give how a part was made."""
-        return _config_of(self.truth["parts"][part]["config"])
+        return parse_config(toml_of(self.truth["parts"][part]["config"]))
 
     def events(self, part: str) -> list[dict[str, Any]]:
         """Give the particles of a part."""
@@ -100,8 +102,8 @@ def make_challenge(
             "parts": {p.name: {"config": config_to_toml(p.config, comments=False)} for p in parts},
             "events": events,
         }
-        text = json.dumps(truth, indent=1, ensure_ascii=False) + "\n"
-        files = sorted(p for p in building.rglob("*") if p.is_file() and p.suffix in _HASHED)
+        text = _as_json(truth)
+        files = sorted(p for p in building.rglob("*") if p.suffix in (".tif", ".toml"))
         manifest = {
             "format": FORMAT,
             "version": VERSION,
@@ -109,21 +111,17 @@ def make_challenge(
             "blind": blind,
             "made_by": f"iscat-analysis {version('iscat-analysis')}",
             "files": {p.relative_to(building).as_posix(): _sha256(p) for p in files},
-            "truth_sha256": hashlib.sha256(text.encode()).hexdigest(),
+            "truth_sha256": hashlib.sha256(text).hexdigest(),
             "parts": described,
         }
-        where = building / TRUTH
-        if blind:
-            with whole_file(beside) as partial:
-                partial.write_bytes(text.encode())
-        else:
-            where.write_bytes(text.encode())
-        written = json.dumps(manifest, indent=1, ensure_ascii=False) + "\n"
-        (building / MANIFEST).write_bytes(written.encode())
+        with whole_file(beside if blind else building / TRUTH) as partial:
+            partial.write_bytes(text)
+        (building / MANIFEST).write_bytes(_as_json(manifest))
     return manifest
 
 
-_HASHED = (".tif", ".toml")
+def _as_json(values: Mapping[str, Any]) -> bytes:
+    return f"{json.dumps(values, indent=1, ensure_ascii=False)}\n".encode()
 
 
 def truth_beside(folder: Path) -> Path:
@@ -175,12 +173,10 @@ def draw_stack(setting: Setting, truth: FloatArray, random: np.random.Generator)
     Shapes: `truth` (4,), result (t, y, x).
     """
     at, camera = setting.config.bounds, setting.config.camera.assumed
-    empty = np.full((setting.pixels, setting.pixels), setting.level_e())
-    frame = empty + setting.signal_e(truth)
-    expected = np.concatenate(
-        [np.broadcast_to(image, (n, *image.shape)) for image, n in
-         ((empty, at.n_before), (frame, at.n_after)) if n]
-    )  # fmt: skip
+    expected = np.full(
+        (at.n_before + at.n_after, setting.pixels, setting.pixels), setting.level_e()
+    )
+    expected[at.n_before :] += setting.signal_e(truth)
     rounded = np.rint(expected * STEPS_PER_ELECTRON) / STEPS_PER_ELECTRON
     electrons = random.poisson(np.maximum(rounded, 0.0)).astype(float)
     if setting.read_variance_e2:
@@ -206,9 +202,8 @@ def _write_stacks(part: Part, folder: Path, seed: Sequence[int]) -> list[dict[st
         random = trial_generator(seed[0], 2000 + seed[1], i)
         truth = centre.copy()
         truth[:2] += random.uniform(-1, 1, 2) * pixel
-        height = random.uniform(*part.z_nm) if part.z_nm is not None else truth[2]
-        factor = float(np.exp(random.uniform(low, high)))
-        truth[2], truth[3] = height, truth[3] * factor
+        truth[2] = random.uniform(*part.z_nm) if part.z_nm is not None else truth[2]
+        truth[3] *= np.exp(random.uniform(low, high))
         truth = np.round(truth, 6)
         counts = draw_stack(setting, truth, random)
         name = f"stacks/{part.name}_{i:04d}.tif"
@@ -225,14 +220,12 @@ def _write_movie(part: Part, folder: Path, seed: Sequence[int]) -> list[dict[str
     number = int(np.random.SeedSequence(list(seed)).generate_state(1)[0])
     table = write_stack(part.config, path, seed=number)
     path.with_suffix(".truth.csv").unlink()
-    return [
-        _event(
-            part.name, f"movies/{path.name}", k, int(row["frame"]),
-            int(row["leave"]) if row["leave"] == row["leave"] and row["leave"] else None,
-            np.array([row[name] for name in PARAMETERS], dtype=float),
-        )
-        for k, row in enumerate(table.astype(object).where(table.notna(), 0).to_dict("records"))
-    ]  # fmt: skip
+    events = []
+    for k, row in enumerate(table.to_dict("records")):
+        leave = int(row["leave"]) if pd.notna(row["leave"]) and row["leave"] else None
+        truth = np.array([row[name] for name in PARAMETERS], dtype=float)
+        events.append(_event(part.name, f"movies/{path.name}", k, int(row["frame"]), leave, truth))
+    return events
 
 
 def _event(
@@ -243,40 +236,27 @@ def _event(
 
 
 def _described(part: Part, events: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    at, stacks = part.told.bounds, part.kind == "stacks"
-    out: dict[str, Any] = {
+    told = part.told
+    about: dict[str, Any] = {
         "kind": part.kind,
-        "mode": part.told.fit.mode,
+        "mode": told.fit.mode,
         "about": part.about,
         "config": f"config/{part.name}.toml",
-        "pixel_size_nm": part.told.camera.pixel_size_nm,
+        "pixel_size_nm": told.camera.pixel_size_nm,
     }
-    if stacks:
-        out |= {
-            "stacks": len(events),
-            "n_before": at.n_before,
-            "n_after": at.n_after,
-            "photons_per_pixel": at.photons_per_pixel,
-        }
-    else:
-        rows, columns = part.told.simulation.shape
-        out |= {"frames": part.told.simulation.frames, "shape": [rows, columns]}
-    return out
-
-
-def _config_of(text: str) -> Config:
-    return parse_config(toml_of(text))
+    if part.kind == "movie":
+        return about | {"frames": told.simulation.frames, "shape": list(told.simulation.shape)}
+    names = ("n_before", "n_after", "photons_per_pixel")
+    return about | {"stacks": len(events), **{name: getattr(told.bounds, name) for name in names}}
 
 
 def _json(path: Path, what: str) -> dict[str, Any]:
     try:
-        found = read_json(path)
+        found = dict(read_json(path))
     except OSError as error:
         raise DataError(f"{path.parent}: {what} ({path.name}: {error.strerror})") from None
-    except ValueError:
+    except (TypeError, ValueError):
         raise DataError(f"{path}: is damaged; get the challenge again") from None
-    if not isinstance(found, dict):
-        raise DataError(f"{path}: is damaged; get the challenge again")
     return found
 
 
@@ -380,33 +360,27 @@ def preset_parts(name: str) -> list[Part]:
     raise ConfigError(f"preset {name!r}: there are {', '.join(ABOUT)}")
 
 
-_SCHEMES: Mapping[str, tuple[float, float]] = {
-    "iscat": (1.0, 3e4),
-    "cobri": (paper.COBRI_ATTENUATION, 3e4),
-    "darkfield": (1.0, 3e3),
+_SCHEMES: Mapping[str, tuple[float, float, dict[str, Any]]] = {
+    "iscat": (1.0, 3e4, {}),
+    "cobri": (paper.COBRI_ATTENUATION, 3e4, {}),
+    "darkfield": (1.0, 3e3, {"photons_per_frame": 3e3}),
 }
-"""Attenuation, and photons per pixel and frame; in dark field those collected per frame."""
+"""Attenuation, photons per pixel and frame, and what else is told of the particle."""
 
 
 def _of_the_paper(scheme: str, kind: str) -> Part:
-    attenuation, photons = _SCHEMES[scheme]
-    config = _config(
-        _PLAIN,
-        {
-            "optics": {
-                **paper.OPTICS,
-                "scheme": scheme,
-                "attenuation": attenuation,
-                "focus_nm": 300.0,
-            },
-            "camera": {"pixel_size_nm": 60.0, "samples_per_pixel": 1},
-            "fit": {"mode": "joint", "z_range_nm": [0.0, 250.0]},
-            "bounds": {"photons_per_pixel": photons, "n_before": 0, "pixels": 45},
-        },
-        drop=("particle", "calibration"),
-        particle=paper.PARTICLE if kind == "gold" else _PROTEIN,
-    )
-    about = f"{kind}, {scheme}"
+    attenuation, photons, further = _SCHEMES[scheme]
+    optics = {**paper.OPTICS, "scheme": scheme, "attenuation": attenuation, "focus_nm": 300.0}
+    material = paper.PARTICLE if kind == "gold" else _PROTEIN
+    plain = {name: keys for name, keys in _PLAIN.items() if name not in ("particle", "calibration")}
+    own: Values = {
+        "optics": optics,
+        "camera": {"pixel_size_nm": 60.0, "samples_per_pixel": 1},
+        "particle": {"height_nm": 100.0, **material, **further},
+        "fit": {"mode": "joint", "z_range_nm": [0.0, 250.0]},
+        "bounds": {"photons_per_pixel": photons, "n_before": 0, "pixels": 45},
+    }
+    config, about = _config(plain, own), f"{kind}, {scheme}"
     return Part(f"{kind}_{scheme}", "stacks", config, config, 40, (90.0, 110.0), (0.9, 1.1), about)
 
 
@@ -420,15 +394,9 @@ def parts_of_config(config: Config, count: int) -> list[Part]:
     return parts
 
 
-def _config(*layers: Values, drop: tuple[str, ...] = (), particle: Any = None) -> Config:
+def _config(*layers: Values) -> Config:
     merged: Values = {}
     for layer in layers:
-        for section, keys in copy.deepcopy(layer).items():
+        for section, keys in layer.items():
             merged[section] = {**merged.get(section, {}), **keys}
-    for section in drop:
-        del merged[section]
-    if particle is not None:
-        merged["particle"] = {"height_nm": 100.0, **particle}
-    if merged["optics"]["scheme"] == "darkfield":
-        merged["particle"]["photons_per_frame"] = merged["bounds"]["photons_per_pixel"]
-    return parse_config(merged)
+    return parse_config(copy.deepcopy(merged))

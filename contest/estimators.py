@@ -74,28 +74,38 @@ class Estimator:
         return made
 
 
-_OURS = "iscat_contest.simple"
-_PEERS = "iscat_contest.peers"
-_PICASSO = '"iscat-analysis[picasso]"'
-# Its requirements, which the fit does not use, contradict ours: pandas < 2.
-_PISCAT = "--no-deps piscat==1.1.4"
+_ABOUT = {
+    "iscat": "this program's fit, in the mode that is studied",
+    "gauss-ls": "Gaussian on the contrast, least squares",
+    "gauss-mle": "Gaussian on the counts, maximum likelihood",
+    "matched-filter": "highest correlation with the model",
+    "dog": "highest difference of Gaussians",
+    "radial-symmetry": "centre of the gradients' lines",
+    "centroid": "centre of mass of the contrast",
+    "peak": "highest pixel",
+    "picasso-gausslq": "Picasso's Gaussian, least squares",
+    "picasso-gaussmle": "Picasso's Gaussian, maximum likelihood",
+    "piscat": "PiSCAT's Gaussian, least squares",
+    "trackpy": "trackpy's refined centre of mass",
+}
+_PACKAGES = {
+    "picasso": '"iscat-analysis[picasso]"',
+    # Its requirements, which the fit does not use, contradict ours: pandas < 2.
+    "piscat": "--no-deps piscat==1.1.4",
+    "trackpy": "",
+}
 
-BUILT_IN = (
-    Estimator("iscat", f"{_OURS}:iscat", "this program's fit, in the mode that is studied"),
-    Estimator("gauss-ls", f"{_OURS}:gauss_ls", "Gaussian on the contrast, least squares"),
-    Estimator("gauss-mle", f"{_OURS}:gauss_mle", "Gaussian on the counts, maximum likelihood"),
-    Estimator("matched-filter", f"{_OURS}:matched_filter", "highest correlation with the model"),
-    Estimator("dog", f"{_OURS}:dog", "highest difference of Gaussians"),
-    Estimator("radial-symmetry", f"{_OURS}:radial_symmetry", "centre of the gradients' lines"),
-    Estimator("centroid", f"{_OURS}:centroid", "centre of mass of the contrast"),
-    Estimator("peak", f"{_OURS}:peak", "highest pixel"),
-    Estimator("picasso-gausslq", f"{_PEERS}:picasso_gausslq", "Picasso's Gaussian, least squares",
-              "picasso", _PICASSO),
-    Estimator("picasso-gaussmle", f"{_PEERS}:picasso_gaussmle",
-              "Picasso's Gaussian, maximum likelihood", "picasso", _PICASSO),
-    Estimator("piscat", f"{_PEERS}:piscat", "PiSCAT's Gaussian, least squares", "piscat", _PISCAT),
-    Estimator("trackpy", f"{_PEERS}:trackpy", "trackpy's refined centre of mass", "trackpy"),
-)  # fmt: skip
+
+def _built_in(name: str, about: str) -> Estimator:
+    """Make the estimator of a function in `simple`, or in `peers` if it is of another package."""
+    package = name.partition("-")[0]
+    install = _PACKAGES.get(package)
+    module, needed = ("simple", "") if install is None else ("peers", package)
+    target = f"iscat_contest.{module}:{name.replace('-', '_')}"
+    return Estimator(name, target, about, needed, install or "")
+
+
+BUILT_IN = tuple(_built_in(*named) for named in _ABOUT.items())
 """What can be named without a module; nothing of it is imported before it is run."""
 
 
@@ -132,7 +142,7 @@ def checked_table(table: Any, count: int) -> dict[str, FloatArray]:
         raise ConfigError(f"returned {type(table).__name__}, no table (DataFrame or dict)")
     columns = {str(name): np.asarray(table[name]).reshape(-1) for name in table}
     known = [name for name in columns if name.removeprefix("sigma_") in COLUMNS]
-    if not any(name in COLUMNS for name in known):
+    if not set(known) & set(COLUMNS):
         raise ConfigError(f"returned none of the columns {', '.join(COLUMNS)}")
     lengths = {columns[name].size for name in known}
     index = columns.get("index", np.arange(count))
@@ -146,9 +156,8 @@ def checked_table(table: Any, count: int) -> dict[str, FloatArray]:
         raise ConfigError(f"returned an index that is not one of 0 … {count - 1}")
     if np.unique(rows).size != rows.size:
         raise ConfigError("returned two rows for one region")
-    out = {}
-    for name in known:
-        out[name] = np.full(count, np.nan)
-        out[name][rows] = columns[name].astype(np.float64)
-        out[name][~np.isfinite(out[name])] = np.nan
+    out = {name: np.full(count, np.nan) for name in known}
+    for name, values in out.items():
+        given = columns[name].astype(np.float64)
+        values[rows] = np.where(np.isfinite(given), given, np.nan)
     return out

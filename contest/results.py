@@ -22,28 +22,23 @@ from iscat_analysis.reading import is_folder
 from iscat_analysis.records import FloatArray
 from iscat_analysis.units import count
 
-PX, NM, ANY = "px", "nm", ""
+_ERRORS = "uncertainty_xy [nm], uncertainty [nm]"
 
-NAMES: Mapping[str, tuple[tuple[str, str], ...]] = {
-    "x_nm": (("x_nm", NM), ("x [nm]", NM), ("x_px", PX), ("x [px]", PX), ("x_coords", PX),
-             ("fit_x-center", PX), ("x", PX)),
-    "y_nm": (("y_nm", NM), ("y [nm]", NM), ("y_px", PX), ("y [px]", PX), ("y_coords", PX),
-             ("fit_y-center", PX), ("y", PX)),
-    "z_nm": (("z_nm", NM), ("z [nm]", NM)),
-    "mass_kda": (("mass_kda", ANY), ("masses_kda", ANY), ("calibrated_values", ANY)),
-    "amplitude": (("amplitude", ANY), ("contrast", ANY), ("contrasts", ANY),
-                  ("fit_amplitude", ANY), ("center_int", ANY), ("center_intensity", ANY),
-                  ("photons", ANY), ("intensity [photon]", ANY), ("signal", ANY), ("mass", ANY)),
-    "sigma_x_nm": (("sigma_x_nm", NM), ("uncertainty_xy [nm]", NM), ("uncertainty [nm]", NM),
-                   ("lpx", PX), ("fit_errors_x-center", PX), ("ep", PX)),
-    "sigma_y_nm": (("sigma_y_nm", NM), ("uncertainty_xy [nm]", NM), ("uncertainty [nm]", NM),
-                   ("lpy", PX), ("fit_errors_y-center", PX), ("ep", PX)),
-    "sigma_z_nm": (("sigma_z_nm", NM), ("uncertainty_z [nm]", NM)),
-    "sigma_mass_kda": (("sigma_mass_kda", ANY),),
-    "frame": (("frame", ANY), ("frame_indices", ANY), ("frames", ANY), ("frame number", ANY)),
-    "score": (("snr", ANY), ("score", ANY), ("net_gradient", ANY)),
-}  # fmt: skip
-"""What each column is called, and its unit; the first that is there is taken."""
+NAMES: Mapping[str, str] = {
+    "x_nm": "x_nm, x [nm], x_px*, x [px]*, x_coords*, fit_x-center*, x*",
+    "y_nm": "y_nm, y [nm], y_px*, y [px]*, y_coords*, fit_y-center*, y*",
+    "z_nm": "z_nm, z [nm]",
+    "mass_kda": "mass_kda, masses_kda, calibrated_values",
+    "amplitude": "amplitude, contrast, contrasts, fit_amplitude, center_int, center_intensity, "
+    "photons, intensity [photon], signal, mass",
+    "sigma_x_nm": f"sigma_x_nm, {_ERRORS}, lpx*, fit_errors_x-center*, ep*",
+    "sigma_y_nm": f"sigma_y_nm, {_ERRORS}, lpy*, fit_errors_y-center*, ep*",
+    "sigma_z_nm": "sigma_z_nm, uncertainty_z [nm]",
+    "sigma_mass_kda": "sigma_mass_kda",
+    "frame": "frame, frame_indices, frames, frame number",
+    "score": "snr, score, net_gradient",
+}
+"""What each column is called, in pixels with a star; the first that is there is taken."""
 
 FILES = ("file", "stack", "movie", "path", "filename", "image")
 EVENTS = ("event", "id", "index", "stack", "region")
@@ -56,6 +51,16 @@ NEAR_FRAMES = 10
 """How far a result lies from the event that it is of, at most."""
 
 _FIT = 0.15  # of a median ratio to a factor
+
+_ADVICE = {
+    "pixels": ", or call them x_px and y_px",
+    "nm, though called pixels": ", or call them x_nm and y_nm",
+}
+
+
+def _lengths(pixel_nm: float) -> dict[str, float]:
+    """Name units that positions may be in, and what they are times to be nanometres."""
+    return {"pixels": pixel_nm, "nm, though called pixels": 1 / pixel_nm, "µm": 1000.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +83,14 @@ def read_results(path: Path, pixel_nm: float, *, rows: bool = False) -> Results:
     known: dict[str, pd.Series] = {}
     notes = []
     for column, choices in NAMES.items():
-        found = next(((name, unit) for name, unit in choices if name in names), None)
+        found = next((c for c in choices.split(", ") if c.rstrip("*") in names), None)
         if found is None:
             continue
-        values = pd.to_numeric(raw[names[found[0]]], errors="coerce")
-        known[column] = values * pixel_nm if found[1] == PX else values
-        if found[0] != column:
-            notes.append(f"{found[0]} → {column}" + (" × pixel size" if found[1] == PX else ""))
+        name, in_pixels = found.rstrip("*"), found.endswith("*")
+        values = pd.to_numeric(raw[names[name]], errors="coerce")
+        known[column] = values * pixel_nm if in_pixels else values
+        if name != column:
+            notes.append(f"{name} → {column}" + (" × pixel size" if in_pixels else ""))
     if THUNDERSTORM in names:
         for axis in ("x_nm", "y_nm"):
             known[axis] = known[axis] - pixel_nm / 2
@@ -149,7 +155,7 @@ def match_movie(
     if "file" in table:
         table = table[table["file"] == stem(movie)]
     elif results.name != stem(movie) and movies > 1:
-        return table.iloc[:0].reindex(range(len(events))), table.iloc[:0]
+        table = table.iloc[:0]
     if len(table) and "frame" not in table:
         raise DataError(
             f"{results.name}: has no column frame, so that nobody knows when its particles of "
@@ -166,19 +172,14 @@ def match_movie(
         )
     table = table.reset_index(drop=True)
     pairs = _assigned(table, events)
-    for factor, said in (
-        (pixel_nm, "pixels"),
-        (1 / pixel_nm, "nm, though called pixels"),
-        (1000.0, "µm"),
-    ):
+    for unit, factor in _lengths(pixel_nm).items():
         scaled = table.assign(x_nm=table["x_nm"] * factor, y_nm=table["y_nm"] * factor)
         better = len(_assigned(scaled, events))
         if better >= 3 and better > 2 * len(pairs):
-            raise DataError(_units_said(results.name, "positions", said, factor))
-    placed = table.iloc[:0].reindex(range(len(events)))
-    for row, event in pairs:
-        placed.loc[event] = table.loc[row]
+            raise DataError(_other_unit(results.name, "positions", unit, factor))
     matched = [row for row, _ in pairs]
+    placed = table.loc[matched].set_axis([event for _, event in pairs])
+    placed = placed.reindex(range(len(events)))
     refuse_other_units(results.name, placed, events, pixel_nm)
     rest = table.drop(index=matched)
     return placed, rest[~_leavings(rest, events)]
@@ -187,69 +188,61 @@ def match_movie(
 def _leavings(table: pd.DataFrame, events: pd.DataFrame) -> NDArray[np.bool_]:
     """Tell which results are of particles that leave: true, and no landings that are scored."""
     left = events[events["leave"].notna()] if "leave" in events else events.iloc[:0]
-    apart = np.hypot(
-        table["x_nm"].to_numpy()[:, None] - left["x_nm"].to_numpy(),
-        table["y_nm"].to_numpy()[:, None] - left["y_nm"].to_numpy(),
-    )
-    late = np.abs(table["frame"].to_numpy()[:, None] - left["leave"].to_numpy(dtype=float))
-    return np.asarray(np.any((apart <= NEAR_NM) & (late <= NEAR_FRAMES), axis=1))
+    apart, late = _apart(table, left.assign(frame=left.get("leave", left["frame"])))
+    return np.asarray(np.any((apart <= 1) & (late <= 1), axis=1))
 
 
 def _assigned(table: pd.DataFrame, events: pd.DataFrame) -> list[tuple[int, int]]:
     """Pair results and events, the nearest first, none farther than `NEAR_NM`, `NEAR_FRAMES`."""
-    apart = np.hypot(
-        table["x_nm"].to_numpy()[:, None] - events["x_nm"].to_numpy(),
-        table["y_nm"].to_numpy()[:, None] - events["y_nm"].to_numpy(),
-    )
-    late = np.abs(table["frame"].to_numpy()[:, None] - events["frame"].to_numpy())
-    cost = apart / NEAR_NM + late / NEAR_FRAMES
-    far = ~((apart <= NEAR_NM) & (late <= NEAR_FRAMES))
-    rows, columns = linear_sum_assignment(np.where(far, 1e6, cost))
+    apart, late = _apart(table, events)
+    far = ~((apart <= 1) & (late <= 1))
+    rows, columns = linear_sum_assignment(np.where(far, 1e6, apart + late))
     return [(int(r), int(c)) for r, c in zip(rows, columns, strict=True) if not far[r, c]]
+
+
+def _apart(table: pd.DataFrame, events: pd.DataFrame) -> tuple[FloatArray, FloatArray]:
+    """Distances of results and events in place and time, over `NEAR_NM` and `NEAR_FRAMES`."""
+    x, y, t = (
+        np.subtract.outer(table[name].to_numpy(float), events[name].to_numpy(float))
+        for name in ("x_nm", "y_nm", "frame")
+    )
+    return np.hypot(x, y) / NEAR_NM, np.abs(t) / NEAR_FRAMES
 
 
 def refuse_other_units(
     name: str, placed: pd.DataFrame, events: pd.DataFrame, pixel_nm: float
 ) -> None:
     """Refuse values that are the truth times a factor of units."""
-    lengths = ((pixel_nm, "pixels"), (1000.0, "µm"), (1 / pixel_nm, "nm, though called pixels"))
+    lengths = _lengths(pixel_nm)
     for column, what, factors in (
         ("x_nm", "positions", lengths),
         ("y_nm", "positions", lengths),
-        ("mass_kda", "masses", ((0.001, "Da"), (1000.0, "MDa"))),
+        ("mass_kda", "masses", {"Da": 0.001, "MDa": 1000.0}),
     ):
         if column not in placed or column not in events:
             continue
-        ratio = _median_ratio(placed[column], events[column])
-        for factor, said in factors:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios = placed[column].abs().to_numpy(float) / events[column].to_numpy(float)
+        known = ratios[np.isfinite(ratios) & (ratios > 0)]
+        ratio = float(np.median(known)) if known.size else 1.0
+        for unit, factor in factors.items():
             if abs(ratio * factor - 1) < _FIT and abs(ratio - 1) > _FIT:
-                raise DataError(_units_said(name, what, said, factor))
+                raise DataError(_other_unit(name, what, unit, factor))
 
 
-def _units_said(name: str, what: str, said: str, factor: float) -> str:
-    names = {
-        "pixels": ", or call them x_px and y_px",
-        "nm, though called pixels": ", or call them x_nm and y_nm",
-    }
+def _other_unit(name: str, what: str, unit: str, factor: float) -> str:
     return (
-        f"{name}: its {what} are in {said}: times {factor:.4g} they fit the truth; convert them"
-        f"{names.get(said, '')}"
+        f"{name}: its {what} are in {unit}: times {factor:.4g} they fit the truth; convert them"
+        f"{_ADVICE.get(unit, '')}"
     )
-
-
-def _median_ratio(estimates: pd.Series, truth: pd.Series) -> float:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.abs(estimates.to_numpy(dtype=float)) / truth.to_numpy(dtype=float)
-    known: FloatArray = ratio[np.isfinite(ratio) & (ratio > 0)]
-    return float(np.median(known)) if known.size else 1.0
 
 
 def _read(path: Path) -> pd.DataFrame:
     table = read_frame(path)
     if table.empty:
         raise DataError(f"{path}: has no rows; a table needs a line of names and its rows")
-    names = [str(name).lower() for name in table.columns]
-    refuse_twice(names, {name for names in NAMES.values() for name, _ in names}, path)
+    known = {name.rstrip("*") for names in NAMES.values() for name in names.split(", ")}
+    refuse_twice([str(name).lower() for name in table.columns], known, path)
     return table
 
 
