@@ -44,12 +44,15 @@ from iscat_analysis.report.style import (
     around,
     field_figure,
     floats,
+    judged,
     legend,
     new_figure,
+    one_panel,
     plain_log,
     points,
     row_of_panels,
     whiskers,
+    whole_numbers,
 )
 from iscat_analysis.report.tables import event_table
 
@@ -87,43 +90,20 @@ def overview(analysis: Analysis, table: pd.DataFrame) -> Figure:
     image = np.asarray(analysis.ratio_image, float)
     # Matplotlib leaves the pixels of small images to the browser, and averages those of large ones.
     how = "none" if max(image.shape) <= 640 else "antialiased"
-    figure, axes, shown, per_inch = field_figure(
+    figure, axes, shown = field_figure(
         image, analysis.scheme, analysis.pixel_size_nm, style={"interpolation": how}
     )
     unit = analysis.scheme_kind.image_unit
     figure.colorbar(shown, ax=axes, label=unit, fraction=0.05, pad=0.02)
     x, y = table["x_px"].to_numpy(float), table["y_px"].to_numpy(float)
-    points(
-        axes, x, y, np.isfinite(x), "o", style={"mfc": "none", "mec": "#F0E442", "ms": 11, "mew": 1}
-    )
+    ring: Style = {"mfc": "none", "mec": "#F0E442", "ms": 11, "mew": 1}
+    points(axes, x, y, np.isfinite(x), style=ring)
+    white: Style = {"color": "white", "fontsize": 7, "path_effects": HALO, "in_layout": False}
     first = table.drop_duplicates("event")[["event", "x_px", "y_px"]].dropna()
-    _number(axes, first.to_numpy(float), np.array(per_inch), image.shape)
+    for number, *place in first.head(100).to_numpy(float):
+        beside: Style = {"xytext": (7, 0), "textcoords": "offset points", "va": "center"}
+        axes.annotate(f"{number:.0f}", place, annotation_clip=True, **beside, **white)
     return figure
-
-
-def _number(axes: Axes, events: FloatArray, per_inch: FloatArray, shape: tuple[int, ...]) -> None:
-    """Write the numbers of the first events beside their rings, where they cover nothing.
-
-    `events` has the rows (number, x, y) [px]; `per_inch` is pixels to an inch along x and y.
-    """
-    field = np.array(shape[::-1], float)
-    ring = 0.08 * per_inch
-    boxes = [(at - ring, at + ring) for at in events[:, 1:]]
-    boxes.append((field * (0.0, 0.9), field * (0.35, 1.0)))  # of the scale bar
-    for number, *place in events[:100]:
-        text = f"{number:.0f}"
-        half = per_inch * (0.065 * len(text), 0.1) / 2
-        for side in ((1, 0), (-1, 0), (0, -1), (0, 1)):
-            middle = place + np.array(side) * (1.3 * ring + half)
-            low, high = middle - half, middle + half
-            free = all((high <= first).any() or (low >= last).any() for first, last in boxes)
-            if free and (low > 0).all() and (high < field).all():
-                boxes.append((low, high))
-                axes.text(
-                    middle[0], middle[1], text, color="white", fontsize=7, ha="center", va="center",
-                    in_layout=False, path_effects=HALO,
-                )  # fmt: skip
-                break
 
 
 # ---- The main quantity ---------------------------------------------------------------------------
@@ -136,13 +116,11 @@ def histogram(analysis: Analysis, table: pd.DataFrame) -> Figure:
     finite, good = np.isfinite(values), _is_ok(table)
     bins = histogram_bins(float(np.ptp(values[finite])), sigma[good & np.isfinite(sigma)])
     edges = np.histogram_bin_edges(values[finite], bins=bins)
-    figure = new_figure(6.2, 3.2)
-    axes = figure.add_subplot()
+    figure, axes = one_panel(6.2, 3.2)
     ok, every = (np.histogram(values[part], bins=edges)[0] for part in (finite & good, finite))
     _stacked(axes, edges, ok, every - ok, PURPLE)
-    if (every > ok).any():
-        legend(figure)
-    _count_events(axes, main.axis)
+    legend(figure)
+    whole_numbers(axes, main.axis)
     return figure
 
 
@@ -173,19 +151,12 @@ def timeline(analysis: Analysis, table: pd.DataFrame) -> Figure:
         for start, stop, share in spans:
             below.fill_between((start, stop), 100 * (1 - share), color=VERMILLION, lw=0)
         below.set(ylim=(0, 100), ylabel="hidden [%]", xlabel="frame")
-    frames, good = table["frame"].to_numpy(float), _is_ok(table)
-    points(
-        axes,
-        frames,
-        values,
-        good,
-        "o",
-        style={"color": BLUE, "ms": 3.5, "alpha": 0.8, "mew": 0, "label": "ok"},
-    )
-    if not good.all():
-        points(
-            axes, frames, values, ~good, "x", style={"color": PURPLE, "ms": 4, "label": "flagged"}
-        )
+    frames, every = table["frame"].to_numpy(float), np.ones(len(table), dtype=bool)
+    for rows, color, name in judged(every, _is_ok(table)):
+        mark, width = ("o", 0) if name == "ok" else ("x", 1)
+        style: Style = {"color": color, "ms": 3.5, "mew": width, "label": name}
+        points(axes, frames, values, rows, mark, style=style)
+    if not _is_ok(table).all():
         legend(figure)
     axes.set(xlabel="" if spans else "frame", ylabel=main.axis)
     axes.xaxis.set_major_locator(MaxNLocator(7, integer=True))
@@ -216,28 +187,14 @@ def precision(analysis: Analysis, table: pd.DataFrame) -> Figure:
             continue
         ends = np.array([crb[usable].min() / 1.15, crb[usable].max() * 1.15])
         axes.plot(ends, ends, color=INK, lw=1.2, label="CRB")
-        dots: Style = {"ms": 3.5, "alpha": 0.7, "mew": 0}
-        points(
-            axes,
-            crb,
-            qcrb,
-            usable,
-            "s",
-            linked=linked,
-            style={"color": BLUE, "label": "QCRB", **dots},
-        )
-        points(
-            axes,
-            crb,
-            sigma,
-            usable & good,
-            "o",
-            linked=linked,
-            style={"color": VERMILLION, "label": "σ", **dots},
-        )
-        if (bad := usable & ~good).any():
-            cross: Style = {"ms": 4, "color": PURPLE, "label": "σ, flagged"}
-            points(axes, crb, sigma, bad, "x", linked=linked, style=cross)
+        for values, rows, mark, color, label in (
+            (qcrb, usable, "s", BLUE, "QCRB"),
+            (sigma, usable & good, "o", VERMILLION, "σ"),
+            (sigma, usable & ~good, "x", PURPLE, "σ, flagged"),
+        ):
+            if rows.any():
+                style: Style = {"ms": 3.5, "mew": mark == "x", "color": color, "label": label}
+                points(axes, crb, values, rows, mark, linked=linked, style=style)
         axes.set_xlim(*ends)
         plain_log(axes, "x", "y")
     legend(figure)
@@ -305,8 +262,7 @@ def budget(analysis: Analysis) -> Figure | None:
     known = [one for one in known if one["sigma_rel"] > 1e-3 * known[0]["sigma_rel"]]
     if not known:
         return None
-    figure = new_figure(6.5, 0.7 + 0.3 * len(known))
-    axes = figure.add_subplot()
+    figure, axes = one_panel(6.5, 0.7 + 0.3 * len(known))
     colors = {"measured": BLUE, "learned": VERMILLION, "assumed": GREY}
     for place, one in enumerate(known):
         long, alpha = 100 * one["sigma_rel"], 1.0 if one["common"] else 0.5
@@ -325,44 +281,30 @@ def diagnostics(analysis: Analysis, table: pd.DataFrame) -> Figure | None:
     columns = [table[name].to_numpy(float) for name in ("chi2_reduced", "p_value")]
     chi2, p_value = (values[np.isfinite(values)] for values in columns)
     noise = analysis.summary.get("landing") or analysis.summary.get("background") or {}
-    drawn: list[Callable[[Axes], None]] = []
-    if chi2.size > 1:
-        drawn.append(partial(_draw_chi2, chi2))
-    if p_value.size > 1:
-        drawn.append(partial(_draw_p_values, p_value))
-    if len(noise.get("noise_frames", ())) > 1:
-        drawn.append(partial(_draw_noise, noise))
-    if not drawn:
+    measured = len(noise.get("noise_frames", ())) > 1
+    number = (chi2.size > 1) + (p_value.size > 1) + measured
+    if not number:
         return None
-    figure, panels = row_of_panels(len(drawn), 3.2, 2.7)
-    for axes, draw_panel in zip(panels, drawn, strict=True):
-        draw_panel(axes)
+    figure, panels = row_of_panels(number, 3.2, 2.7)
+    left = iter(panels)
+    if chi2.size > 1:
+        axes = next(left)
+        axes.hist(chi2, bins=int(np.clip(np.sqrt(chi2.size), 8, 40)), color=GREY)
+        axes.axvline(1.0, color=INK, lw=1, ls="--")
+        whole_numbers(axes, "reduced χ²")
+    if p_value.size > 1:
+        axes = next(left)
+        axes.hist(p_value, bins=20, range=(0.0, 1.0), color=GREY)
+        axes.axhline(p_value.size / 20, color=INK, lw=1, ls="--")
+        whole_numbers(axes, "p-value")
+    if measured:
+        axes = next(left)
+        axes.axhline(1.0, color=INK, lw=1, ls="--")
+        over_shot = floats(noise["noise_variance_over_shot"])
+        axes.plot(noise["noise_frames"], over_shot, "o", color=VERMILLION, ms=4)
+        plain_log(axes, "x")
+        axes.set(xlabel="frames averaged", ylabel="variance over shot noise")
     return figure
-
-
-def _draw_chi2(chi2: FloatArray, axes: Axes) -> None:
-    axes.hist(chi2, bins=int(np.clip(np.sqrt(chi2.size), 8, 40)), color=GREY)
-    axes.axvline(1.0, color=INK, lw=1, ls="--")
-    _count_events(axes, "reduced χ²")
-
-
-def _draw_p_values(p_values: FloatArray, axes: Axes) -> None:
-    axes.hist(p_values, bins=20, range=(0.0, 1.0), color=GREY)
-    axes.axhline(p_values.size / 20, color=INK, lw=1, ls="--")
-    _count_events(axes, "p-value")
-
-
-def _count_events(axes: Axes, against: str) -> None:
-    axes.set(xlabel=against, ylabel="events")
-    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-
-
-def _draw_noise(noise: Mapping[str, Any], axes: Axes) -> None:
-    axes.axhline(1.0, color=INK, lw=1, ls="--")
-    over_shot = floats(noise["noise_variance_over_shot"])
-    axes.plot(noise["noise_frames"], over_shot, "o", color=VERMILLION, ms=4)
-    plain_log(axes, "x")
-    axes.set(xlabel="frames averaged", ylabel="variance over shot noise")
 
 
 # ---- Where in the movie? -------------------------------------------------------------------------
@@ -371,72 +313,50 @@ def _draw_noise(noise: Mapping[str, Any], axes: Axes) -> None:
 def movie_figure(analysis: Analysis) -> Figure:
     """Draw light, noise, focus, drift and events of a movie, on one axis of frames."""
     course = analysis.summary["timeline"]
-    rows = _rows(analysis, course)
-    figure = new_figure(7.0, 0.75 + 0.72 * len(rows))
-    panels = np.atleast_1d(figure.subplots(len(rows), 1, sharex=True))
+    frames, noise, focus, x, y = (
+        floats(course[name])
+        for name in ("frames", "noise_over_expected", "focus_nm", "drift_x_px", "drift_y_px")
+    )
+    if not analysis.scheme_kind.interferes:
+        focus = focus * np.nan
+    rows: list[tuple[str, Any, Any, str]] = [
+        ("light,\nrelative", analysis.power_frames, [analysis.power], "-"),
+        ("noise,\nvariance over\nexpected", frames, [noise], "o"),
+        ("focus\n[nm]", frames, [focus], "-"),
+        ("drift\n[px]", frames, [x, y], "-"),
+    ]
+    rows = [row for row in rows if np.isfinite(row[2]).any()]
+    figure = new_figure(7.0, 1.47 + 0.72 * len(rows))
+    panels = figure.subplots(len(rows) + 1, 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (label, at, lines, mark) in zip(panels, rows, strict=False):
+        for values, color, name in zip(lines, (BLUE, VERMILLION), "xy", strict=False):
+            named = name if len(lines) > 1 else None
+            axes.plot(at, values, mark, color=color, lw=1, ms=2.5, label=named)
+        _name_row(axes, label)
     edges = course["events"]["edges"]
+    ok, flagged = (np.array(course["events"][name]) for name in ("ok", "flagged"))
+    _stacked(panels[-1], edges, ok, flagged, VERMILLION)
+    _name_row(panels[-1], "events")
     narrow = 0.004 * (edges[-1] - edges[0])  # the least that is seen of an interval
-    for axes, (label, draw_row) in zip(panels, rows.items(), strict=True):
-        draw_row(axes)
-        for one in course["intervals"]:
-            hidden = one["what"].startswith("partly")
-            ends = one["start"], max(one["stop"], one["start"] + narrow)
-            name, color, alpha = (
-                ("partly hidden", GREY, 0.2) if hidden else ("left out", PURPLE, 0.3)
-            )
-            axes.axvspan(*ends, lw=0, color=color, alpha=alpha, label=name)
-        axes.set_ylabel(label, rotation=0, ha="right", va="center")
-        # 0.7 inches of room for the numbers beside a row: to measure it takes half of drawing
-        beside = ScaledTranslation(-0.7, 0, figure.dpi_scale_trans)
-        axes.yaxis.set_label_coords(0, 0.5, transform=axes.transAxes + beside)
-        axes.yaxis.set_major_locator(MaxNLocator(3))
-    panels[-1].yaxis.set_major_locator(MaxNLocator(3, integer=True))
+    for one in course["intervals"]:
+        style: Style = {"color": PURPLE, "alpha": 0.3, "label": "left out"}
+        if one["what"].startswith("partly"):
+            style = {"color": GREY, "alpha": 0.2, "label": "partly hidden"}
+        for axes in panels:
+            axes.axvspan(one["start"], max(one["stop"], one["start"] + narrow), lw=0, **style)
     panels[-1].set(xlabel="frame", xlim=(edges[0], edges[-1]))
     panels[-1].xaxis.set_major_locator(MaxNLocator(7, integer=True))
     legend(figure)
     return figure
 
 
-def _rows(analysis: Analysis, course: Mapping[str, Any]) -> dict[str, Callable[[Axes], None]]:
-    """Name the rows that have something to show, and what draws each."""
-    frames, noise, focus, x, y = (
-        floats(course[name])
-        for name in ("frames", "noise_over_expected", "focus_nm", "drift_x_px", "drift_y_px")
-    )
-
-    def light(axes: Axes) -> None:
-        axes.axhline(1.0, color=GREY, lw=0.8, ls="--")
-        axes.plot(analysis.power_frames, analysis.power, color=BLUE, lw=0.8)
-
-    def noise_row(axes: Axes) -> None:
-        axes.axhline(1.0, color=GREY, lw=0.8, ls="--")
-        axes.plot(frames, noise, "o", color=VERMILLION, ms=2.5)
-        low, high = axes.get_ylim()
-        axes.set_ylim(min(low, 0.95), max(high, 1.05))
-
-    def focus_row(axes: Axes) -> None:
-        axes.plot(frames, focus, color=BLUE, lw=1.2)
-        low, high = axes.get_ylim()
-        if high - low < 1.0:  # of a focus that stays
-            axes.set_ylim(low - 1.0, high + 1.0)
-
-    def drift(axes: Axes) -> None:
-        axes.plot(frames, x, color=BLUE, lw=1.2, label="x")
-        axes.plot(frames, y, color=VERMILLION, lw=1.2, label="y")
-
-    def events(axes: Axes) -> None:
-        ok, flagged = (np.array(course["events"][name]) for name in ("ok", "flagged"))
-        _stacked(axes, course["events"]["edges"], ok, flagged, VERMILLION)
-
-    has_focus = analysis.scheme_kind.interferes and np.isfinite(focus).any()
-    rows = (
-        (np.isfinite(analysis.power).any(), "light,\nrelative", light),
-        (np.isfinite(noise).any(), "noise,\nvariance over\nexpected", noise_row),
-        (has_focus, "focus\n[nm]", focus_row),
-        (np.isfinite(x).any(), "drift\n[px]", drift),
-        (True, "events", events),
-    )
-    return {label: draw_row for shown, label, draw_row in rows if shown}
+def _name_row(axes: Axes, label: str) -> None:
+    """Name a row at its left, with 0.7 inches for its numbers: measuring takes half of drawing."""
+    axes.set_ylabel(label, rotation=0, ha="right", va="center")
+    figure = axes.get_figure(root=True)
+    beside = ScaledTranslation(-0.7, 0, figure.dpi_scale_trans) if figure else axes.transAxes
+    axes.yaxis.set_label_coords(0, 0.5, transform=axes.transAxes + beside)
+    axes.yaxis.set_major_locator(MaxNLocator(3, integer=label == "events"))
 
 
 # ---- One at a time, for a notebook ---------------------------------------------------------------
@@ -448,11 +368,9 @@ def draw(analysis: Analysis, kind: str) -> Figure:
     main = table[main_quantity(analysis).column].to_numpy(float)
     if kind != "overview" and not np.isfinite(main).any():
         raise DataError(f"{_movie(analysis)}: no event was found, so there is no {kind} to draw")
-    if analysis.tracks is not None and kind == "overview":
-        return _shown(partial(track_figures.trajectories, analysis, table))
-    if analysis.tracks is not None and kind == "histogram":
-        return _shown(partial(track_figures.distributions, analysis))
     makers = {"overview": overview, "histogram": histogram, "precision": precision}
+    if analysis.tracks is not None:
+        makers |= {"overview": track_figures.trajectories, "histogram": track_figures.distributions}
     return _shown(partial(makers[kind], analysis, table))
 
 

@@ -166,6 +166,12 @@ def floats(values: Iterable[float | None]) -> FloatArray:
     return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
 
 
+def one_panel(width: float, height: float) -> tuple[Figure, Axes]:
+    """Make a figure of one panel."""
+    figure = new_figure(width, height)
+    return figure, figure.add_subplot()
+
+
 def row_of_panels(number: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
     """Make a figure of panels side by side, each of this size."""
     figure = new_figure(width * number, height)
@@ -217,6 +223,21 @@ def points(
         line.set_rasterized(True)
     elif linked:
         line.set_gid("rows-" + "_".join(map(str, at)))
+
+
+def judged(
+    rows: BoolArray, good: BoolArray, color: str = BLUE
+) -> Iterator[tuple[BoolArray, str, str]]:
+    """Give the rows that are ok and those that are flagged, with colour and label, if any are."""
+    for part, name in ((rows & good, "ok"), (rows & ~good, "flagged")):
+        if part.any():
+            yield part, color if name == "ok" else PURPLE, name
+
+
+def whole_numbers(axes: Axes, x_label: str = "", y_label: str = "events", most: int = 5) -> None:
+    """Name the axes of a histogram, whose numbers are whole."""
+    axes.set(xlabel=x_label, ylabel=y_label)
+    axes.yaxis.set_major_locator(MaxNLocator(most, integer=True))
 
 
 def whiskers(
@@ -287,8 +308,8 @@ def field_figure(
     *,
     bright: float = 1.0,
     style: Style | None = None,
-) -> tuple[Figure, Axes, AxesImage, tuple[float, float]]:
-    """Draw a field of view; give pixels to an inch along x and y too.
+) -> tuple[Figure, Axes, AxesImage]:
+    """Draw a field of view.
 
     The pixels of a field that is more than five times as long as wide are stretched, because
     nothing could be recognised otherwise.
@@ -303,13 +324,9 @@ def field_figure(
         stretch = "tall as wide" if drawn > true else "wide as tall"
         times = max(drawn / true, true / drawn)
         axes.set_title(f"pixels are drawn {times:.2g} times as {stretch}", fontsize=8)
-    wide = min(across, tall / drawn)
-    per_inch = columns / wide, rows / (wide * drawn)
     low, high = display_range([image], scheme)
-    shown = axes.imshow(
-        image, cmap="gray", vmin=bright * low, vmax=bright * high,
-        aspect=per_inch[0] / per_inch[1], **(style or {}),
-    )  # fmt: skip
+    greys: Style = {"cmap": "gray", "vmin": bright * low, "vmax": bright * high}
+    shown = axes.imshow(image, aspect=drawn / true, **greys, **(style or {}))
     scale_bar(axes, columns, rows, pixel_size_nm)
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xlabel="x [px]", ylabel="y [px]")
-    return figure, axes, shown, per_inch
+    return figure, axes, shown

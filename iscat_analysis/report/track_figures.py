@@ -111,7 +111,7 @@ def trajectories(analysis: Analysis, fits: pd.DataFrame) -> Figure:
     """Draw the field with the paths of its particles, coloured by mass."""
     tracks = tracks_of(analysis)
     image = np.asarray(analysis.ratio_image, float)
-    figure, axes, _, _ = field_figure(
+    figure, axes, _ = field_figure(
         image,
         analysis.scheme,
         analysis.pixel_size_nm,

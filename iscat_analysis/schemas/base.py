@@ -26,42 +26,45 @@ Parameter = Literal["x_nm", "y_nm", "z_nm", "mass_kda"]
 End = Literal["movie", "border", "inside"]
 
 _VALUES: dict[str, Any] = {
-    "count": Count, "natural": Natural, "number": Number, "positive": Positive,
-    "not_negative": NotNegative | None, "share": Share, "span": NotNegative | None,
-    "text": str | None, "end": End,
-}  # fmt: skip
+    "count": Count,
+    "natural": Natural,
+    "number": Number,
+    "positive": Positive,
+    "share": Share,
+    "text": str | None,
+    "end": End,
+    **dict.fromkeys(("not_negative", "span"), NotNegative | None),
+}
 """Type of the values of a column; that of its status depends on the table."""
 
 
-def key(description: str) -> Any:
-    """Describe a key that is always there."""
-    return Field(description=description)
+Notes = Annotated[list[str], Field(description="What the user should know, one line each")]
+ABSENT: Any = None
+"""Default of a key that may be absent, whatever its type."""
 
 
-def maybe(description: str) -> Any:
-    """Describe a key that may be absent."""
-    return Field(default=None, description=description)
+class Part(BaseModel):
+    """A part of a document; what a key holds is said below it."""
+
+    model_config = ConfigDict(defer_build=True, use_attribute_docstrings=True)
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        """Put descriptions on one line."""
+        for field in cls.model_fields.values():
+            field.description = " ".join((field.description or "").split()) or None
 
 
-Error = Annotated[Number, key("Its standard error")]
-KnownError = Annotated[NotNegative, key("Its standard error")]
-Ends = Annotated[Interval, key("Its 95 % confidence interval")]
-Low = Annotated[Number, key("End of its 95 % interval")]
-High = Annotated[Number, key("The other end")]
-Notes = Annotated[list[str], key("What the user should know, one line each")]
-Written = Annotated[str, maybe("When printed: the folder that was written")]
-
-
-class Document(BaseModel):
+class Document(Part):
     """A document, or a part of one, that may have further keys."""
 
-    model_config = ConfigDict(extra="allow", defer_build=True)  # a command needs one of them
+    model_config = ConfigDict(extra="allow")
 
 
-class Closed(BaseModel):
+class Closed(Part):
     """A part that has the keys named here and no other."""
 
-    model_config = ConfigDict(extra="forbid", defer_build=True)
+    model_config = ConfigDict(extra="forbid")
 
 
 def row_model(name: str, doc: str, columns: Iterable[Column], status: Any) -> type[Closed]:
@@ -69,8 +72,6 @@ def row_model(name: str, doc: str, columns: Iterable[Column], status: Any) -> ty
     fields: dict[str, Any] = {}
     for column in columns:
         values = (_VALUES | {"status": status})[column.values]
-        if column.optional:
-            fields[column.name] = values | None, maybe(column.description)
-        else:
-            fields[column.name] = values, key(column.description)
+        about = Field(default=None if column.optional else ..., description=column.description)
+        fields[column.name] = (values | None if column.optional else values), about
     return create_model(name, __base__=Closed, __doc__=doc, **fields)

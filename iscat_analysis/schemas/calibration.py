@@ -5,126 +5,180 @@ from __future__ import annotations
 from typing import Any, Literal
 
 from iscat_analysis.schemas.base import (
+    ABSENT,
     Closed,
     Count,
     Document,
-    KnownError,
     Notes,
     NotNegative,
     Number,
     Share,
-    Written,
-    key,
-    maybe,
 )
 
 
 class Estimate(Closed):
     """A measured number."""
 
-    value: float = key("The estimate")
-    se: KnownError
-    ci95: tuple[float, float] = key("Its 95 % interval")
+    value: float
+    """The estimate"""
+    se: NotNegative
+    """Its standard error"""
+    ci95: tuple[float, float]
+    """Its 95 % interval"""
 
 
 class PhotonTransfer(Closed):
     """Variance against mean, in groups of pixels."""
 
-    mean_adu: list[float] = key("Mean [counts]")
-    variance_adu2: list[float] = key("Variance between frames [counts²]")
-    variance_se: list[NotNegative] = key("Its standard error [counts²]")
-    fit_adu2: list[Number] = key("The fitted line [counts²]")
-    pixels: list[Count] = key("How many pixels")
+    mean_adu: list[float]
+    """Mean [counts]"""
+    variance_adu2: list[float]
+    """Variance between frames [counts²]"""
+    variance_se: list[NotNegative]
+    """Its standard error [counts²]"""
+    fit_adu2: list[Number]
+    """The fitted line [counts²]"""
+    pixels: list[Count]
+    """How many pixels"""
 
 
 class Averaging(Closed):
     """Noise against averaging."""
 
-    n_frames: list[Count] = key("Frames averaged before and after")
-    contrast_noise: list[NotNegative] = key("Standard deviation of the contrast of a pixel")
-    contrast_noise_se: list[Number] = key("Its standard error")
-    shot_noise: list[Number] = key("What the photoelectrons alone would give")
-    excess: list[Number] = key("Variance over that of the photoelectrons")
-    excess_se: list[Number] = key("Its standard error")
-    comparisons: list[Count] = key("How many pairs of averages")
+    n_frames: list[Count]
+    """Frames averaged before and after"""
+    contrast_noise: list[NotNegative]
+    """Standard deviation of the contrast of a pixel"""
+    contrast_noise_se: list[Number]
+    """Its standard error"""
+    shot_noise: list[Number]
+    """What the photoelectrons alone would give"""
+    excess: list[Number]
+    """Variance over that of the photoelectrons"""
+    excess_se: list[Number]
+    """Its standard error"""
+    comparisons: list[Count]
+    """How many pairs of averages"""
 
 
 class Camera(Document):
     """What iscat calibrate camera prints and writes as camera.json."""
 
-    recordings: list[str] = maybe("In the file: the stacks")
-    dark: str | None = maybe("In the file: the dark")
-    gain_e_per_adu: Estimate | None = key("Photoelectrons per count [e]")
-    offset_adu: Estimate = key("Counts in the dark [counts]")
-    offset_from: Literal["dark", "given", "flicker", "line"] = key("Where the offset is from")
-    read_noise_adu: Estimate | None = key("Read noise, standard deviation [counts]")
-    read_noise_e: Estimate | None = key("Read noise, standard deviation [e]")
-    read_noise_below_e: NotNegative | None = key("95 % limit of one too small [e]")
-    shot_limited_frames: Count | None = key("Frames that may be averaged before other noise shows")
-    verdict: str = key("The same as a sentence")
-    frames: Count = key("Frames that were used")
-    masked_pixels: dict[str, Count] = key("Pixels left out, by reason")
-    photon_transfer: PhotonTransfer = key("Variance against mean")
-    noise: Averaging = key("Noise against averaging")
+    recordings: list[str] = ABSENT
+    """In the file: the stacks"""
+    dark: str | None = ABSENT
+    """In the file: the dark"""
+    gain_e_per_adu: Estimate | None
+    """Photoelectrons per count [e]"""
+    offset_adu: Estimate
+    """Counts in the dark [counts]"""
+    offset_from: Literal["dark", "given", "flicker", "line"]
+    """Where the offset is from"""
+    read_noise_adu: Estimate | None
+    """Read noise, standard deviation [counts]"""
+    read_noise_e: Estimate | None
+    """Read noise, standard deviation [e]"""
+    read_noise_below_e: NotNegative | None
+    """Upper limit, 95 %, of a read noise too small to measure [e]"""
+    shot_limited_frames: Count | None
+    """Frames that may be averaged before other noise shows"""
+    verdict: str
+    """The same as a sentence"""
+    frames: Count
+    """Frames that were used"""
+    masked_pixels: dict[str, Count]
+    """Pixels left out, by reason"""
+    photon_transfer: PhotonTransfer
+    """Variance against mean"""
+    noise: Averaging
+    """Noise against averaging"""
     notes: Notes
-    out: Written
+    out: str = ABSENT
+    """The folder that was written; not in the file"""
 
 
 class ContrastPeak(Closed):
     """A peak of the contrasts."""
 
-    contrast: NotNegative = key("Size of the peak's contrast")
-    contrast_se: KnownError
-    width: NotNegative = key("Standard deviation of the peak beyond the events' own")
-    count: NotNegative = key("Events in it")
+    contrast: NotNegative
+    """Size of the peak's contrast"""
+    contrast_se: NotNegative
+    """Its standard error"""
+    width: NotNegative
+    """Standard deviation of the peak beyond the events' own"""
+    count: NotNegative
+    """Events in it"""
 
 
 class Standard(Closed):
     """A standard, and the mass of its peak on the line."""
 
-    mass_kda: float = key("Known mass [kDa]")
-    mass_se: KnownError
-    contrast: float = key("Signed contrast of its peak")
-    contrast_se: KnownError
-    width: NotNegative = key("Standard deviation of the peak beyond the events' own")
-    count: NotNegative = key("Events in it")
-    found_kda: float = key("Its mass by the line [kDa]")
-    residual_percent: float = key("found_kda beside mass_kda [%]")
-    low_kda: Number = key("Lower end of the prediction interval [kDa]")
-    high_kda: Number = key("Upper end [kDa]")
+    mass_kda: float
+    """Known mass [kDa]"""
+    mass_se: NotNegative
+    """Its standard error [kDa]"""
+    contrast: float
+    """Signed contrast of its peak"""
+    contrast_se: NotNegative
+    """Its standard error"""
+    width: NotNegative
+    """Standard deviation of the peak beyond the events' own"""
+    count: NotNegative
+    """Events in it"""
+    found_kda: float
+    """Its mass by the line [kDa]"""
+    residual_percent: float
+    """found_kda beside mass_kda [%]"""
+    low_kda: Number
+    """Lower end of the prediction interval [kDa]"""
+    high_kda: Number
+    """Upper end [kDa]"""
 
 
 class Histogram(Closed):
     """A histogram."""
 
-    edges: list[NotNegative] = key("Edges of the bins")
-    counts: list[Count] = key("Events in each")
+    edges: list[NotNegative]
+    """Edges of the bins"""
+    counts: list[Count]
+    """Events in each"""
 
 
 class StandardsCamera(Closed):
     """The camera of the standards."""
 
-    pixel_size_nm: NotNegative = maybe("Pixel side [nm]")
-    samples_per_pixel: Literal["auto"] | Count = key("Samples per pixel, per axis")
-    fill_factor: Share = key("Share of a pixel's area that detects light")
-    gain_e_per_adu: NotNegative = maybe("Photoelectrons per count, where it is one number")
-    offset_adu: float = maybe("Counts in the dark, where they are one number")
+    pixel_size_nm: NotNegative = ABSENT
+    """Pixel side [nm]"""
+    samples_per_pixel: Literal["auto"] | Count
+    """Samples per pixel, per axis"""
+    fill_factor: Share
+    """Share of a pixel's area that detects light"""
+    gain_e_per_adu: NotNegative = ABSENT
+    """Photoelectrons per count, where it is one number"""
+    offset_adu: float = ABSENT
+    """Counts in the dark, where they are one number"""
 
 
 class StandardsCovariance(Closed):
     """Errors of the optics of the standards."""
 
-    names: list[str] = key("Learned keys of [optics]")
-    matrix: list[list[float]] = key("Their covariance")
+    names: list[str]
+    """Learned keys of [optics]"""
+    matrix: list[list[float]]
+    """Their covariance"""
 
 
 class Standards(Closed):
     """Optics and camera with which the standards were recorded and analysed."""
 
-    optics: dict[str, Any] = key("Keys of [optics]")
-    covariance: StandardsCovariance | None = key("Of these, where they were learned")
-    height_nm: NotNegative = key("Height of the particles [nm]")
-    camera: StandardsCamera = key("The camera")
+    optics: dict[str, Any]
+    """Keys of [optics]"""
+    covariance: StandardsCovariance | None
+    """Of these, where they were learned"""
+    height_nm: NotNegative
+    """Height of the particles [nm]"""
+    camera: StandardsCamera
+    """The camera"""
 
 
 class MassCalibration(Document):
@@ -133,125 +187,206 @@ class MassCalibration(Document):
     The line between contrast and mass: contrast = gradient · mass + sign · offset.
     """
 
-    source: str = maybe("In the file: the table of events")
-    gradient_per_kda: float = key("Signed peak contrast per kDa")
-    gradient_se: KnownError
-    offset: float = key("Contrast at zero mass")
-    offset_se: KnownError
-    covariance: tuple[tuple[float, float], tuple[float, float]] = key("Of gradient and offset")
-    chi2: NotNegative = key("χ² of the standards about the line")
-    dof: Count = key("Its degrees of freedom")
-    landing: Literal["dark", "bright"] = key("What a landing particle makes its position")
-    events: Count = key("Landing events that were used")
-    standards: list[Standard] = key("The standards, lightest first")
-    peaks: list[ContrastPeak] = key("Every peak that was found")
+    source: str = ABSENT
+    """In the file: the table of events"""
+    gradient_per_kda: float
+    """Signed peak contrast per kDa"""
+    gradient_se: NotNegative
+    """Its standard error"""
+    offset: float
+    """Contrast at zero mass"""
+    offset_se: NotNegative
+    """Its standard error"""
+    covariance: tuple[tuple[float, float], tuple[float, float]]
+    """Of gradient and offset"""
+    chi2: NotNegative
+    """χ² of the standards about the line"""
+    dof: Count
+    """Its degrees of freedom"""
+    landing: Literal["dark", "bright"]
+    """Whether a landing particle makes its position darker or brighter"""
+    events: Count
+    """Landing events that were used"""
+    standards: list[Standard]
+    """The standards, lightest first"""
+    peaks: list[ContrastPeak]
+    """Every peak that was found"""
     notes: Notes
-    recorded: Standards | None = key("Optics and camera of the standards, null if unknown")
-    histogram: Histogram = maybe("In the file: sizes of the contrasts")
-    out: Written
+    recorded: Standards | None
+    """Optics and camera of the standards, null if unknown"""
+    histogram: Histogram = ABSENT
+    """In the file: sizes of the contrasts"""
+    out: str = ABSENT
+    """The folder that was written; not in the file"""
 
 
 class OpticsParameter(Closed):
     """A parameter of the optics."""
 
-    parameter: str = key("Its key in [optics], or the name of an aberration")
-    value: float = key("Its value")
-    sigma: Number = key("Its standard error, null where it was not measured")
-    crb: Number = key("Its Cramér–Rao bound, null where it was not measured")
-    configured: float = key("What the configuration says")
-    state: Literal["measured", "prior", "dropped", "given"] = key(
-        "measured; prior, because images tell little of it beyond its usual error; dropped, "
-        "because it does not improve the fits; or given, because it was not to be learned"
-    )
+    parameter: str
+    """Its key in [optics], or the name of an aberration"""
+    value: float
+    """Its value"""
+    sigma: Number
+    """Its standard error, null where it was not measured"""
+    crb: Number
+    """Its Cramér–Rao bound, null where it was not measured"""
+    configured: float
+    """What the configuration says"""
+    state: Literal["measured", "prior", "dropped", "given"]
+    """measured; prior, because images tell little of it beyond its usual error; dropped, because it
+    does not improve the fits; or given, because it was not to be learned"""
 
 
 class HeldOut(Closed):
     """How well optics describe images that were held out."""
 
-    p_values: list[float] = key("Of each picture")
-    chi2_reduced: list[float] = key("Of each picture")
-    uniform_p: float = key("Chance that uniform p-values look less uniform")
+    p_values: list[float]
+    """Of each picture"""
+    chi2_reduced: list[float]
+    """Of each picture"""
+    uniform_p: float
+    """Chance that uniform p-values look less uniform"""
 
 
 class Twin(Closed):
     """Other optics that give the same images."""
 
-    settings: dict[str, float | bool | str] = key("Its parameters")
-    gap: float = key("Log-likelihood by which it is worse")
+    settings: dict[str, float | bool | str]
+    """Its parameters"""
+    gap: float
+    """Log-likelihood by which it is worse"""
 
 
 class Template(Document):
     """What iscat calibrate optics --measured prints and writes as template.json."""
 
-    accepted: bool = key("Whether the template may be used")
-    refusals: list[str] = key("Why it may not, one line each")
-    particles: Count = key("Pictures that made it")
-    contaminated: Count = key("Pictures left out, because something else happened in them")
-    determined: float = key("Degrees of freedom of the image that the data determine")
-    peak_se: float = key("Relative standard error of the peak, common to all contrasts")
-    pixel_nm: float = key("Pixel side [nm]")
-    roi_nm: float = key("Side of the square in which it is known [nm]")
-    held_out: HeldOut = key("Pictures that were held out, by a template of the others")
-    source: dict[str, str] = key("Source of the images")
-    out: Written
+    accepted: bool
+    """Whether the template may be used"""
+    refusals: list[str]
+    """Why it may not, one line each"""
+    particles: Count
+    """Pictures that made it"""
+    contaminated: Count
+    """Pictures left out, because something else happened in them"""
+    determined: float
+    """Degrees of freedom of the image that the data determine"""
+    peak_se: float
+    """Relative standard error of the peak, common to all contrasts"""
+    pixel_nm: float
+    """Pixel side [nm]"""
+    roi_nm: float
+    """Side of the square in which it is known [nm]"""
+    held_out: HeldOut
+    """Pictures that were held out, by a template of the others"""
+    source: dict[str, str]
+    """Source of the images"""
+    out: str = ABSENT
+    """When printed: the output folder"""
 
 
 class OpticsPictures(Closed):
     """Data of the page."""
 
-    measured: list[list[float]] = key("Average contrast of the particles")
-    model: list[list[float]] = key("The same, by the microscope that was found")
-    residual: list[list[float]] = key("Their difference in standard deviations")
-    pixel_nm: float = key("Pixel side [nm]")
-    radius_nm: list[float] = key("Distance from the particle [nm]")
-    radial: list[float] = key("Average contrast on rings")
-    radial_se: list[float] = key("Its standard error")
-    radial_model: list[float] = key("The same, by the microscope that was found")
-    wavefront_nm: list[list[Number]] = key("Aberrations over the pupil [nm], null outside")
-    transmission: list[list[Number]] = key("Amplitude that the mask passes, null outside")
-    na: float = key("Radius of the pupil")
+    measured: list[list[float]]
+    """Average contrast of the particles"""
+    model: list[list[float]]
+    """The same, by the microscope that was found"""
+    residual: list[list[float]]
+    """Their difference in standard deviations"""
+    pixel_nm: float
+    """Pixel side [nm]"""
+    radius_nm: list[float]
+    """Distance from the particle [nm]"""
+    radial: list[float]
+    """Average contrast on rings"""
+    radial_se: list[float]
+    """Its standard error"""
+    radial_model: list[float]
+    """The same, by the microscope that was found"""
+    wavefront_nm: list[list[Number]]
+    """Aberrations over the pupil [nm], null outside"""
+    transmission: list[list[Number]]
+    """Amplitude that the mask passes, null outside"""
+    na: float
+    """Radius of the pupil"""
 
 
 class Optics(Document):
     """What iscat calibrate optics prints and writes as optics.json."""
 
-    accepted: bool = key("Whether the result may be used")
-    refusals: list[str] = key("Why it may not, one line each")
-    parameters: list[OpticsParameter] = key("Every parameter")
-    names: list[str] = key("The measured ones, in the order of covariance")
-    covariance: list[list[float]] = key("Of the measured parameters")
-    correlation: list[list[float]] = key("Of the measured parameters")
-    settings: dict[str, float | bool | str] = key("Keys of [optics]; aberrations by name [nm]")
-    untold: list[str] = key("Parameters of which the images tell little: state prior")
-    dropped: list[str] = key("Aberrations that improve nothing")
-    undecided: list[str] = key("Discrete properties that the images do not determine")
-    twin: Twin | None = key("A second microscope that is as likely")
-    held_out: HeldOut = key("Pictures that were not fitted, in the measured microscope")
-    held_out_as_configured: HeldOut = key("The same in the configured microscope")
-    particles: Count = key("Pictures that were used")
-    contaminated: Count = key("Pictures left out because something else happened in them")
-    source: dict[str, str] = key("Movie, its hash, and the program's version")
-    pictures: OpticsPictures = maybe("In the file: data of the page")
+    accepted: bool
+    """Whether the result may be used"""
+    refusals: list[str]
+    """Why it may not, one line each"""
+    parameters: list[OpticsParameter]
+    """Every parameter"""
+    names: list[str]
+    """The measured ones, in the order of covariance"""
+    covariance: list[list[float]]
+    """Of the measured parameters"""
+    correlation: list[list[float]]
+    """Of the measured parameters"""
+    settings: dict[str, float | bool | str]
+    """Keys of [optics]; aberrations by name [nm]"""
+    untold: list[str]
+    """Parameters of which the images tell little: state prior"""
+    dropped: list[str]
+    """Aberrations that improve nothing"""
+    undecided: list[str]
+    """Discrete properties that the images do not determine"""
+    twin: Twin | None
+    """A second microscope that is as likely"""
+    held_out: HeldOut
+    """Pictures that were not fitted, in the measured microscope"""
+    held_out_as_configured: HeldOut
+    """The same in the configured microscope"""
+    particles: Count
+    """Pictures that were used"""
+    contaminated: Count
+    """Pictures left out because something else happened in them"""
+    source: dict[str, str]
+    """Movie, its hash, and the program's version"""
+    pictures: OpticsPictures = ABSENT
+    """In the file: data of the page"""
     notes: Notes
-    out: Written
+    out: str = ABSENT
+    """The folder that was written; not in the file"""
 
 
 class Learned(Closed):
     """The test of the optics by ``optics.calibrate``, and the learned optics."""
 
-    tested: Count = maybe("Bright isolated particles, or tracks")
-    median_p: Share = maybe("Median p-value of the brightest with the configured optics")
-    log_bayes_factor: Number = maybe("Of other optics over the configured ones, by all images")
-    left_over: Number = maybe("Residual image of the configured optics over the image, rms")
-    left_over_then: Number = maybe("Of learned optics used though held-out images reject them")
-    calibrated: bool = key("Whether the analysis used learned optics")
-    reason: str = maybe("Why not, if the test asked for it or was not possible")
-    accepted: bool = maybe("Whether the learned optics could be used")
-    refusals: list[str] = maybe("Why not, one line each")
-    parameters: list[OpticsParameter] = maybe("Every parameter")
-    names: list[str] = maybe("Parameters that images may tell, in the order of covariance")
-    values: list[float] = maybe("Of the optics of the analysis, learned or as configured")
-    covariance: list[list[float]] = maybe("Of their errors, prior included")
-    field_px: list[float] | None = maybe("Centre x, y and half the longer side of its field [px]")
-    twin: Twin | None = maybe("Second optics that are as likely")
-    notes: list[str] = maybe("What the user should know, one line each")
+    tested: Count = ABSENT
+    """Bright isolated particles, or tracks"""
+    median_p: Share = ABSENT
+    """Median p-value of the brightest with the configured optics"""
+    log_bayes_factor: Number = ABSENT
+    """Of other optics over the configured ones, by all images"""
+    left_over: Number = ABSENT
+    """What the configured optics leave over of the images, beyond the noise, over the images (root
+    mean square)"""
+    left_over_then: Number = ABSENT
+    """The same with learned optics that are used although images that were held out reject them"""
+    calibrated: bool
+    """Whether the analysis used learned optics"""
+    reason: str = ABSENT
+    """Why not, if the test asked for it or was not possible"""
+    accepted: bool = ABSENT
+    """Whether the learned optics could be used"""
+    refusals: list[str] = ABSENT
+    """Why not, one line each"""
+    parameters: list[OpticsParameter] = ABSENT
+    """Every parameter"""
+    names: list[str] = ABSENT
+    """Parameters that images may tell, in the order of covariance"""
+    values: list[float] = ABSENT
+    """Of the optics of the analysis, learned or as configured"""
+    covariance: list[list[float]] = ABSENT
+    """Of their errors, by images and by what is known without them"""
+    field_px: list[float] | None = ABSENT
+    """Centre x, y and half the longer side of the field of its terms [pixels]; null without any"""
+    twin: Twin | None = ABSENT
+    """Second optics that are as likely"""
+    notes: list[str] = ABSENT
+    """What the user should know, one line each"""
