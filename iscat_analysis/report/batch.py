@@ -48,6 +48,7 @@ from iscat_analysis.report.style import (
     PURPLE,
     VERMILLION,
     new_figure,
+    one_panel,
     plain_log,
     publish,
     whiskers,
@@ -202,12 +203,9 @@ def _overview(batch: BatchContents) -> Section:
     done = movies[movies["state"] == "done"]
     analysed = done[done["role"] != "flat"]
     cautioned = int((done["cautions"].fillna("") != "").sum())
+    whole = f"of {len(movies)}" if len(done) < len(movies) else "all of the table"
     facts = [
-        Fact(
-            "Movies",
-            str(len(done)),
-            note=f"of {len(movies)}" if len(done) < len(movies) else "all of the table",
-        ),
+        Fact("Movies", str(len(done)), note=whole),
         Fact("Samples", str(analysed["sample"].nunique())),
         Fact("Events", str(int(analysed["events"].sum()))),
         Fact("With cautions", str(cautioned), note="see the quality"),
@@ -256,13 +254,13 @@ def _shift_table(batch: BatchContents) -> Table:
     masses, shares = (of_kind.loc[[name]] for name in ("mass_kda", "share"))
     both = masses.merge(shares, on=["kind", "sample"], suffixes=("", "_of_share"))
 
-    def columns(label: str, end: str, scale: float, unit: str, *titles: str) -> list[Column]:
-        value = (f"value{end}", f"low{end}", f"high{end}")
-        shift = (f"shift{end}", f"shift_low{end}", f"shift_high{end}")
-        how: dict[str, Any] = {"scale": scale, "unit": unit}
+    def columns(label: str, shift: str, end: str, title: str) -> list[Column]:
+        is_share = bool(end)
+        ends = (f"low{end}", f"high{end}")
+        moved = (f"shift_low{end}", f"shift_high{end}")
         return [
-            *intervals(label, value, titles=(titles[0], titles[1]), **how),
-            *intervals(titles[2], shift, **how),
+            *intervals(label, f"value{end}", ends, in_percent=is_share, title=title),
+            *intervals(shift, f"shift{end}", moved, in_percent=is_share),
             numeric("p", of(f"p_holm{end}", probability), _HOLM),
         ]
 
@@ -270,30 +268,23 @@ def _shift_table(batch: BatchContents) -> Table:
         numeric("kind [kDa]", of("kind_mass_kda", "{:.3g}".format)),
         *_SAMPLE,
         numeric("movies", of("movies", int)),
-        *columns(batch.mass_label, "", 1, "", "", "with the scatter between movies", "shift [kDa]"),
-        *columns("share", "_of_share", 100, " %", _SHARE, "", "shift"),
+        *columns(batch.mass_label, "shift [kDa]", "", "intervals with the scatter between movies"),
+        *columns("share", "shift", "_of_share", _SHARE),
     ]
     return _table(both, every, "Species by sample, and their shifts")
 
 
 def _species_table(batch: BatchContents) -> Table:
+    def kind(row: Any) -> str:
+        return "apart" if row["outlier"] else str(row["kind"])
+
     columns = [
-        worded(
-            "kind",
-            lambda row: "apart" if row["outlier"] else str(row["kind"]),
-            "one number for species of one mass; apart: an outlier",
-        ),
+        worded("kind", kind, "one number for species of one mass; apart: an outlier"),
         *batch.labels,
-        *intervals(batch.mass_label, ("mass_kda", "mass_low", "mass_high")),
-        *intervals(
-            "width [kDa]",
-            ("width_kda", "width_low", "width_high"),
-            titles=("beyond the events' errors", ""),
-        ),
+        *intervals(batch.mass_label, "mass_kda"),
+        *intervals("width [kDa]", "width_kda", title="beyond the events' errors"),
         numeric("events", of("count", fixed, 0)),
-        *intervals(
-            "share", ("share", "share_low", "share_high"), scale=100, unit=" %", titles=(_SHARE, "")
-        ),
+        *intervals("share", "share", in_percent=True, title=_SHARE),
         numeric("detected", of("efficiency", percent, 0)),
     ]
     return _table(batch.species, columns, "Species by movie")
@@ -307,34 +298,35 @@ def _equilibria(batch: BatchContents, drawn: Mapping[str, Markup]) -> Section:
     ]
 
     def ends(row: Any) -> str:
-        low, high = row[1]["kd_low"], row[1]["kd_high"]
-        return f"{number(low)} to {number(high) if math.isfinite(high) else '∞'}"
+        high = number(row["kd_high"]) if math.isfinite(row["kd_high"]) else "∞"
+        return f"{number(row['kd_low'])} to {high}"
 
     reactions = {"dimer": "2 M ⇌ D", "ab": "A + B ⇌ AB"}
     columns = [
-        worded("condition", lambda row: row[0] or "—"),
-        worded("reaction", lambda row: reactions[row[1]["model"]]),
-        numeric("movies", lambda row: len(row[1]["samples"])),
-        numeric("K_D [nM]", lambda row: number(row[1]["kd_nm"])),
+        worded("condition", lambda row: row["condition"] or "—"),
+        worded("reaction", lambda row: reactions[row["model"]]),
+        numeric("movies", lambda row: len(row["samples"])),
+        numeric("K_D [nM]", of("kd_nm")),
         numeric("95 %", ends, "of the profile likelihood"),
-        numeric(
-            "p",
-            lambda row: probability(row[1]["p_value"]),
-            "whether the movies follow the equilibrium",
-        ),
-        worded("remarks", lambda row: "; ".join(row[2]) or "none"),
+        numeric("p", of("p_value", probability), "whether the movies follow the equilibrium"),
+        worded("remarks", lambda row: "; ".join(row["remarks"]) or "none"),
     ]
-    tables = [tabulate(batch.equilibria, columns)]
+    rows = [
+        {**found, "condition": condition, "remarks": remarks}
+        for condition, found, remarks in batch.equilibria
+    ]
+    tables = [tabulate(rows, columns)]
     return Section("equilibrium", "Equilibrium", charts=charts, tables=tables)
 
 
 def _landing(batch: BatchContents, drawn: Mapping[str, Markup]) -> Section:
     known = batch.movies[batch.movies["rate"].notna()]
+    per = f"landings per {known['rate_unit'].iloc[0]}"
     columns = [
         *batch.labels,
         numeric("landed", of("landings", int)),
         numeric("left", of("leavings", int)),
-        *intervals(f"landings per {known['rate_unit'].iloc[0]}", ("rate", "rate_from", "rate_to")),
+        *intervals(per, "rate", ("rate_from", "rate_to")),
     ]
     tables = [_table(known, columns, "Landings")]
     return Section("landing", "Landing", charts=_charts(drawn, "rates"), tables=tables)
@@ -347,6 +339,9 @@ def _quality(batch: BatchContents) -> Section:
     def cautions(row: Any) -> str:
         return row["cautions" if row["state"] == "done" else "why"] or "none"
 
+    def ok(row: Any) -> str:
+        return percent(row["ok"] / row["events"] if row["events"] else None, 1)
+
     columns = [
         worded("movie", lambda row: links[row["movie"]]),
         worded("role", "role"),
@@ -355,33 +350,19 @@ def _quality(batch: BatchContents) -> Section:
         worded("state", of("state", states.get)),
         worded("cautions", cautions),
         worded("answer", of("answer", plain)),
-        numeric("events", of("events", _whole)),
-        numeric("ok", lambda row: _share(row["ok"], row["events"]), "events with status ok"),
-        numeric(
-            "noise", of("noise_over_shot", fixed, 2), "variance over shot noise, in its windows"
-        ),
+        numeric("events", of("events", fixed, 0)),
+        numeric("ok", ok, "events with status ok"),
+        numeric("noise", of("noise_over_shot", fixed, 2), "variance over shot noise"),
         numeric("drift [px]", of("drift_px", fixed, 2), "of the fixed pattern"),
-        numeric(
-            "focus [nm]", of("focus_shift_nm", fixed, 0), "from the day's, where it was measured"
-        ),
+        numeric("focus [nm]", of("focus_shift_nm", fixed, 0), "from the day's, if measured"),
         numeric("p < 0.01", of("small_p_values", percent, 1), "1 % where the model holds"),
-        numeric(
-            "spread/CRB", of("repeat_over_crb", fixed, 2), "measured between parts of the frames"
-        ),
+        numeric("spread/CRB", of("repeat_over_crb", fixed, 2), "between parts of the frames"),
         worded("standards", of("standards_seen", unbroken)),
         worded("optics", of("optics", unbroken, 80)),
         worded("mass scale", of("mass_scale", unbroken, 80)),
         numeric("beyond", of("outside_standards", percent, 1), "masses beyond the standards"),
     ]
     return Section("quality", "Movies and their quality", tables=[_table(batch.movies, columns)])
-
-
-def _whole(value: float | None) -> int | None:
-    return int(value) if value is not None and math.isfinite(value) else None
-
-
-def _share(part: float, whole: float) -> str:
-    return percent(part / whole, 1) if whole and math.isfinite(whole) else "—"
 
 
 # ---- Figures -------------------------------------------------------------------------------------
@@ -485,8 +466,7 @@ def _stacked(
         name = _shortened(f"{group}: {sample}" if several else sample, 34)
         names.append(f"{name}  ({sum(masses.size for masses in own)})")
     step = 1.05 * max(float(mean.max()) for mean in means.values())
-    figure = new_figure(_WIDTH, 0.9 + 0.29 * len(rows))
-    axes = figure.add_subplot()
+    figure, axes = one_panel(_WIDTH, 0.9 + 0.29 * len(rows))
     for k, (key, mean) in enumerate(means.items()):
         base, color = -k * step, colors[rows[key]]
         axes.stairs(base + mean, edges, baseline=base, fill=True, color=color, alpha=0.35, lw=0)
@@ -529,8 +509,7 @@ def _points(
 
 def _species(species: pd.DataFrame, label: str) -> Figure:
     """Draw mass of every species against the sample."""
-    figure = new_figure(_WIDTH, 3.4)
-    axes = figure.add_subplot()
+    figure, axes = one_panel(_WIDTH, 3.4)
     place = _places(species, axes)
     kinds = sorted(species["kind"].unique())
     for kind, color in zip(kinds, shades(len(kinds)), strict=True):
@@ -576,8 +555,7 @@ def _rates(movies: pd.DataFrame) -> Figure:
     """Draw how many landed per time, against concentration where it is known, else the sample."""
     known = movies[movies["concentration_nm"] > 0]
     against = known["concentration_nm"].nunique() > 1
-    figure = new_figure(_WIDTH, 3.2)
-    axes = figure.add_subplot()
+    figure, axes = one_panel(_WIDTH, 3.2)
     table = known if against else movies
     x = table["concentration_nm"].to_numpy(float) if against else _places(table, axes)
     groups = list(dict.fromkeys(table["group"]))

@@ -70,22 +70,26 @@ def numeric(label: str, cell: Cell, title: str = "") -> Column:
 
 def intervals(
     label: str,
-    names: tuple[str, str, str],
+    name: str,
+    ends: tuple[str, str] | None = None,
     *,
-    scale: float = 1.0,
-    unit: str = "",
-    titles: tuple[str, str] = ("", ""),
+    in_percent: bool = False,
+    title: str = "",
 ) -> tuple[Column, Column]:
-    """Make the columns of a number and its interval; `names` are the keys of value and ends."""
+    """Make the columns of a number and its interval, whose keys differ in ``_low`` and ``_high``.
+
+    Units at the end of `name` are not in the names of the ends.
+    """
+    stem = name.removesuffix("_kda").removesuffix("_nm")
+    scale, unit = (100, " %") if in_percent else (1, "")
 
     def cells(record: Any) -> tuple[str, str]:
-        value, low, high = (record[name] for name in names)
-        ends = (None if end is None else scale * end for end in (value, low, high))
-        return with_interval(*ends, unit=unit)
+        found = (record[key] for key in (name, *(ends or (f"{stem}_low", f"{stem}_high"))))
+        return with_interval(*(None if v is None else scale * v for v in found), unit=unit)
 
     return (
-        numeric(label, lambda record: cells(record)[0], titles[0]),
-        numeric("95 %", lambda record: cells(record)[1], titles[1]),
+        numeric(label, lambda record: cells(record)[0], title),
+        numeric("95 %", lambda record: cells(record)[1]),
     )
 
 

@@ -22,6 +22,7 @@ from iscat_analysis.report.numbers import (
     intervals,
     number,
     numeric,
+    of,
     percent,
     sentence,
     tabulate,
@@ -37,6 +38,7 @@ from iscat_analysis.report.style import (
     Style,
     floats,
     new_figure,
+    one_panel,
     whiskers,
 )
 from iscat_analysis.text import in_figure
@@ -53,6 +55,7 @@ FONTS = ("sans-serif", "serif", "monospace")
 Format = Literal["svg", "pdf", "png"]
 
 _NAMED = 12  # samples whose names fit beside an axis
+_CORRECTED = ("corrected_low", "corrected_high")
 
 
 # ---- Species of a movie --------------------------------------------------------------------------
@@ -68,32 +71,16 @@ def distribution_section(found: Mapping[str, Any], figures: Mapping[str, Markup]
         "events, not to the bins."
     )
     columns = (
-        *intervals("mass [kDa]", ("mass_kda", "mass_low", "mass_high")),
+        *intervals("mass [kDa]", "mass_kda"),
+        *intervals("width [kDa]", "width_kda", title="beyond the events' measurement errors"),
+        numeric("events", of("count", fixed, 0), "that were seen"),
+        numeric("landing", of("landing", fixed, 0)),
+        numeric("leaving", of("leaving", fixed, 0)),
+        numeric("detected", of("efficiency", percent, 1), "chance to detect such a particle"),
         *intervals(
-            "width [kDa]",
-            ("width_kda", "width_low", "width_high"),
-            titles=("beyond the events' measurement errors", ""),
+            "came", "count_corrected", _CORRECTED, title="and those that were missed"
         ),
-        numeric("events", lambda s: fixed(s["count"], 0), "that were seen"),
-        numeric("landing", lambda s: fixed(s["landing"], 0)),
-        numeric("leaving", lambda s: fixed(s["leaving"], 0)),
-        numeric(
-            "detected",
-            lambda s: percent(s["efficiency"], 1),
-            "chance that such a particle is detected",
-        ),
-        *intervals(
-            "came",
-            ("count_corrected", "corrected_low", "corrected_high"),
-            titles=("events corrected for those that were missed", ""),
-        ),
-        *intervals(
-            "fraction",
-            ("fraction", "fraction_low", "fraction_high"),
-            scale=100,
-            unit=" %",
-            titles=("of the particles that came", ""),
-        ),
+        *intervals("fraction", "fraction", in_percent=True, title="of the particles that came"),
     )
     title = f"Species by mass; intervals from {found['draws']} simulated repetitions"
     return Section(
@@ -108,30 +95,25 @@ def distribution_section(found: Mapping[str, Any], figures: Mapping[str, Markup]
 
 def _lead(found: Mapping[str, Any]) -> str:
     described = [item for item in found["species"] if not item.get("background")]
-    fitted = len(described)
     count = sum(not item["outlier"] for item in described)
-    rivals = [row["delta_bic"] for row in found["selection"] if row["species"] != fitted]
+    rivals = [row["delta_bic"] for row in found["selection"] if row["species"] != len(described)]
     text = (
         f"{count} species explain {found['events']} events best (BIC), fitted to the events "
         "themselves, each with its own error."
         if count > 1
         else f"One species explains {found['events']} events best (BIC)."
     )
-    if count < fitted:
+    if count < len(described):
         text += " What lies apart from them in one or two events is listed, and is no species."
     for item in found["species"]:
         if item.get("background"):
             share = 100 * item["count"] / found["events"]
             text += f" {share:.2g} % of the events are background, which is no species."
-    support = found["support"]
-    wins = ""
-    if support is not None and support == support:
-        wins = f" in {100 * support:.0f} % of simulated repetitions the same number wins."
     if rivals:
-        text += f" The next best number is worse by {number(min(rivals), 2)}" + (
-            ";" if wins else "."
-        )
-    return text + wins
+        text += f" The next best number is worse by {number(min(rivals), 2)}."
+    if (support := found["support"]) is not None and support == support:
+        text += f" In {100 * support:.0f} % of simulated repetitions the same number wins."
+    return text
 
 
 def species_figure(found: Mapping[str, Any]) -> Figure | None:
@@ -186,19 +168,9 @@ def sizes_section(found: Mapping[str, Any], figures: Mapping[str, Markup]) -> Se
         "them."
     )
     columns = (
-        *intervals("median diameter [nm]", ("diameter_nm", "diameter_low", "diameter_high")),
-        *intervals(
-            "geometric standard deviation",
-            ("geometric_sd", "geometric_sd_low", "geometric_sd_high"),
-            titles=("of the diameters, beyond their errors", ""),
-        ),
-        *intervals(
-            "fraction",
-            ("fraction", "fraction_low", "fraction_high"),
-            scale=100,
-            unit=" %",
-            titles=("of the spheres that were seen", ""),
-        ),
+        *intervals("median diameter [nm]", "diameter_nm"),
+        *intervals("geometric standard deviation", "geometric_sd", title="beyond their errors"),
+        *intervals("fraction", "fraction", in_percent=True, title="of the spheres seen"),
         numeric("spheres", lambda p: fixed(p["count"], 0) + (", outlier" if p["outlier"] else "")),
     )
     title = f"Populations by diameter; intervals from {found['draws']} simulated repetitions"
@@ -206,9 +178,7 @@ def sizes_section(found: Mapping[str, Any], figures: Mapping[str, Markup]) -> Se
         "species",
         "Sizes",
         f"{which} {found['spheres']} spheres best (BIC), each with its own error.",
-        charts=[
-            Chart("species-figure", "Diameters and populations", figures["sizes"], caption, True)
-        ],
+        charts=[Chart("species-figure", "Diameters", figures["sizes"], caption, True)],
         tables=[tabulate(found["populations"], columns, title)],
         notes=[sentence(note) for note in found["notes"]],
     )
@@ -216,18 +186,15 @@ def sizes_section(found: Mapping[str, Any], figures: Mapping[str, Markup]) -> Se
 
 def sizes_figure(found: Mapping[str, Any]) -> Figure:
     """Draw the histogram of diameters and the populations."""
-    figure = new_figure(9.6, 3.4)
-    axes = figure.add_subplot()
+    figure, axes = one_panel(9.6, 3.4)
     width = _bars(axes, found["histogram"], "nm", "spheres")
     diameter, model = floats(found["curve"]["diameter_nm"]), width * floats(found["curve"]["model"])
     axes.plot(diameter, model, color=VERMILLION, lw=1.6, label="populations, with errors")
     for each in found["populations"]:
         middle, spread = each["diameter_nm"], each["geometric_sd"]
-        height, ends = (
-            np.interp(middle, diameter, model) / 2,
-            [[middle / spread], [middle * spread]],
-        )
-        whiskers(axes, [height], [middle], ends, along="x", style={"color": INK, "capsize": 3})
+        height, ends = np.interp(middle, diameter, model) / 2, (middle / spread, middle * spread)
+        axes.plot(ends, [height] * 2, "|-", color=INK)
+        axes.plot(middle, height, "o", color=INK, ms=4)
     axes.set(xlabel="diameter [nm]", ylabel=f"spheres per {width:g} nm", ylim=(0, None))
     axes.legend(loc="best")
     return figure
@@ -245,13 +212,9 @@ def comparison_figure(
     left, middle, right = figure.subplots(1, 3, width_ratios=(1.8, 1, 1))
     colours = (GREY, VERMILLION, BLUE, PURPLE)
     for place, drawn in enumerate(histograms):
-        style: Style = {
-            "color": colours[place % 4],
-            "fill": not place,
-            "alpha": 0.9 if place else 0.5,
-        }
+        style: Style = {"color": colours[place % 4], "alpha": 0.9 if place else 0.5}
         name = _short(drawn["source"])
-        left.stairs(drawn["share"], drawn["edges"], lw=1.2, label=name, **style)
+        left.stairs(drawn["share"], drawn["edges"], fill=not place, lw=1.2, label=name, **style)
     width = histograms[0]["edges"][1] - histograms[0]["edges"][0]
     left.set(xlabel="|mass| [kDa]", ylabel=f"share of events per {number(width, 2)} kDa")
     left.legend()
@@ -259,8 +222,7 @@ def comparison_figure(
     differences = ("difference", "difference_low", "difference_high")
     _intervals(right, pairs, differences, "difference of fractions")
     right.set_yticklabels([])
-    handles, labels = middle.get_legend_handles_labels()
-    right.legend(handles, labels, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    right.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     right.locator_params(axis="x", nbins=5)
     yield "comparison", figure
 
@@ -275,15 +237,8 @@ def _intervals(
         rows = [pair["species"][i] for pair in pairs]
         at, low, high = (floats(row[name] for row in rows) for name in names)
         places = np.arange(len(rows)) + 0.6 * ((i + 0.5) / kinds - 0.5)
-        name = f"{number(rows[0]['mass_kda'])} kDa"
-        whiskers(
-            axes,
-            places,
-            at,
-            (low, high),
-            along="x",
-            style={"ms": 3.5, "color": colour, "label": name},
-        )
+        style: Style = {"ms": 3.5, "color": colour, "label": f"{number(rows[0]['mass_kda'])} kDa"}
+        whiskers(axes, places, at, (low, high), along="x", style=style)
     axes.axvline(0, color=GREY, lw=0.8)
     axes.set(xlabel=f"{label}, 95 %", ylim=(len(pairs) - 0.5, -0.5))
     if len(pairs) <= _NAMED:
@@ -365,15 +320,12 @@ def histogram_figure(
     colours = PALETTES[palette]
     shares = len(samples) > 1
     with mpl.rc_context({**STYLE, "font.family": font[0], "font.size": font[1]}):
-        figure = new_figure(*(side / 2.54 for side in size_cm))
-        axes = figure.add_subplot()
+        figure, axes = one_panel(*(side / 2.54 for side in size_cm))
         for place, (name, mass) in enumerate(samples):
             scale = 1.0 / max(mass.counts.sum(), 1.0) if shares else 1.0
             colour = colours[place % len(colours)]
-            style: Style = {"fill": True, "alpha": 0.45, "color": GREY}
-            if shares:
-                style = {"fill": False, "alpha": 0.9, "color": colour}
-            axes.stairs(mass.counts * scale, mass.edges, label=name, **style)
+            style: Style = {"color": colour if shares else GREY, "alpha": 0.9 if shares else 0.45}
+            axes.stairs(mass.counts * scale, mass.edges, fill=not shares, label=name, **style)
             if density:
                 axes.plot(mass.mass_kda, mass.density * scale, color=colour, lw=1.2)
         if curve is not None:
@@ -387,8 +339,7 @@ def histogram_figure(
         bar = samples[0][1].bin_kda if samples else 1.0
         label = "share of events" if shares else "events"
         axes.set(xlabel="|mass| [kDa]", ylabel=f"{label} per {bar:g} kDa")
-        axes.set_xlim(left=0)
-        axes.set_ylim(bottom=0)
+        axes.set(xlim=(0, None), ylim=(0, None))
         if shares or curve is not None:
             axes.legend(loc="best")
     return figure
