@@ -7,6 +7,7 @@ amplitudes become masses by one factor (see `estimators`).
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -69,8 +70,8 @@ def gauss_ls(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Ta
     """
     images = setup.image(before, after)
 
-    def residual(i: int, cut: Cut, model: FloatArray) -> FloatArray:
-        return model - images[i][cut]
+    def residual(i: int, cut: Cut, model: FloatArray) -> tuple[FloatArray, Any]:
+        return model - images[i][cut], 1.0
 
     return _fitted(images, setup, residual, is_standard=False)
 
@@ -85,11 +86,14 @@ def gauss_mle(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> T
     background = np.maximum(before * (setup.n_after / max(setup.n_before, 1)), 1e-9)
     unit = background if setup.interferes else np.full_like(background, setup.n_after)
 
-    def residual(i: int, cut: Cut, model: FloatArray) -> FloatArray:
+    def residual(i: int, cut: Cut, model: FloatArray) -> tuple[FloatArray, Any]:
         counts = after[i][cut]
         mean = np.maximum(background[i][cut] + unit[i][cut] * model, 1e-9)
         deviance = 2 * (mean - counts + counts * np.log(np.maximum(counts, 1e-12) / mean))
-        return np.sign(mean - counts) * np.sqrt(np.maximum(deviance, 0.0))
+        r = np.sign(mean - counts) * np.sqrt(np.maximum(deviance, 0.0))
+        near = np.abs(r) < 1e-6
+        steep = np.where(near, 1 / np.sqrt(mean), (1 - counts / mean) / np.where(near, 1, r))
+        return r, steep * unit[i][cut]
 
     return _fitted(setup.image(before, after), setup, residual, is_standard=True)
 
@@ -97,11 +101,14 @@ def gauss_mle(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> T
 def _fitted(
     images: FloatArray,
     setup: EstimatorSetup,
-    residual: Callable[[int, Cut, FloatArray], FloatArray],
+    residual: Callable[[int, Cut, FloatArray], tuple[FloatArray, Any]],
     *,
     is_standard: bool,
 ) -> Table:
-    """Fit a Gaussian to every region from its start; residuals may be in standard deviations."""
+    """Fit a Gaussian of amplitude, centre, width and level to every region from its start.
+
+    `residual` gives residuals and their derivatives by the model; they may be in standard errors.
+    """
     pixel, starts = setup.pixel_size_nm, setup.start[:, :2] / setup.pixel_size_nm
     half = half_width(setup.optics, pixel)
 
@@ -109,13 +116,25 @@ def _fitted(
         cut = around(images.shape[1:], starts[i], half)
         y, x = (np.arange(part.start, part.stop, dtype=float) for part in cut)
         scale = float(np.max(np.abs(images[i][cut]))) or 1.0
+        weight = 1.0 if is_standard else 1 / scale
 
-        def misfit(p: FloatArray) -> FloatArray:
+        def bell(p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
             u, v = (x - p[1]) / p[3], ((y - p[2]) / p[3])[:, None]
-            return residual(i, cut, scale * (p[0] * np.exp(-(u**2 + v**2) / 2) + p[4])).ravel()
+            return u, v, np.exp(-(u**2 + v**2) / 2)
+
+        def of(p: FloatArray) -> tuple[FloatArray, Any]:
+            left, steep = residual(i, cut, scale * (p[0] * bell(p)[2] + p[4]))
+            return weight * left.ravel(), weight * scale * np.ravel(steep)[:, None]
+
+        def slopes(p: FloatArray) -> FloatArray:
+            u, v, g = bell(p)
+            by_width = p[0] * g / p[3]
+            parts = (g, by_width * u, by_width * v, by_width * (u**2 + v**2), np.ones_like(g))
+            return np.stack(parts, axis=-1).reshape(-1, 5) * of(p)[1]
 
         begin = [0.8 * setup.polarity, *starts[i], setup.psf_sigma_nm / pixel, 0.0]
-        found = least_squares(misfit, begin, method="lm", max_nfev=_EVALUATIONS)
+        how: dict[str, Any] = {"method": "lm", "max_nfev": _EVALUATIONS}
+        found = least_squares(lambda p: of(p)[0], begin, slopes, **how)
         if not found.success or not np.all(np.isfinite(found.x)):
             return np.full((2, 5), np.nan)
         noise = 1.0 if is_standard else 2 * found.cost / max(found.fun.size - 5, 1)
