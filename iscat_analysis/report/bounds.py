@@ -32,6 +32,7 @@ from iscat_analysis.report.style import (
     Style,
     legend,
     new_figure,
+    one_panel,
     picture,
     plain_log,
     publish,
@@ -75,13 +76,10 @@ def write_bounds(
 def design_toml(design: PupilOptimum) -> str:
     """Write the experiment with the best pupil."""
     config = design.config
-    maps = ("gain_e_per_adu", "offset_adu")
-    camera = {
-        key: str(Path(value).resolve())
-        for key in maps
-        if isinstance(value := getattr(config.camera.assumed, key), str)
-    }
-    config = config.model_copy(update={"camera": config.camera.model_copy(update=camera)})
+    assumed = config.camera.assumed
+    values = {key: getattr(assumed, key) for key in ("gain_e_per_adu", "offset_adu")}
+    maps = {key: str(Path(v).resolve()) for key, v in values.items() if isinstance(v, str)}
+    config = config.model_copy(update={"camera": config.camera.model_copy(update=maps)})
     sections = ("optics", "camera", "particle", "background", "fit", "bounds")
     return (
         "# The pupil with the smallest joint bound of "
@@ -131,8 +129,7 @@ def tradeoff_figure(report: Mapping[str, Any]) -> Figure:
     names = ("z_nm", "mass_kda")
     own = np.array([actual["qcrb"][name] for name in names])
     camera = np.array([actual["crb_joint"][name] for name in names])
-    figure = new_figure(5.2, 4.2)
-    axes = figure.add_subplot()
+    figure, axes = one_panel(5.2, 4.2)
     axes.axvline(own[0], color=BLUE, lw=1.2, ls="--", label="quantum bound of each alone")
     axes.axhline(own[1], color=BLUE, lw=1.2, ls="--")
     axes.plot(*edge.T, color=BLUE, lw=1.8, label="both at once, at best (Holevo)")
@@ -163,8 +160,7 @@ def write_optics_bounds(
 
 def needed_figures(report: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     """Draw how many particles of which mass the precisions take."""
-    figure = new_figure(6.4, 4.2)
-    axes = figure.subplots()
+    figure, axes = one_panel(6.4, 4.2)
     needed, goals = pd.DataFrame(report["needed"]), report["goals"]
     lines = (
         ("focus_nm", f"focus to {goals['focus_nm']:g} nm", BLUE, "-"),
@@ -172,8 +168,8 @@ def needed_figures(report: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
         ("identified", "everything identified", INK, ":"),
     )
     for column, label, color, dash in lines:
-        style: Style = {"color": color, "lw": 1.8, "marker": "o", "ms": 4}
-        axes.plot(needed["mass_kda"], needed[column].astype(float), dash, label=label, **style)
+        style: Style = {"color": color, "ls": dash, "lw": 1.8, "ms": 4, "label": label}
+        axes.plot(needed["mass_kda"], needed[column].astype(float), "o", **style)
     here = report["at"]["mass_kda"], report["events"]
     axes.plot(*here, "D", color=VERMILLION, ms=7, label="planned")
     axes.set(xscale="log", yscale="log", xlabel="mass [kDa]", ylabel="particles needed")
@@ -232,21 +228,19 @@ class Panel:
 
 
 _Z, _F = "height z [nm]", "focus height [nm]"
-_MASS = "σ of mass / mass, one photon"
+_AXIAL, _MASS = "σ of z, one photon [nm]", "σ of mass / mass, one photon"
+_TWO = ("mass", "mass joint")
 PANELS = {
     "2b": Panel("Fig. 2b: on-axis phase", _Z, "phase [rad]", False, ("phase",)),
-    "2c": Panel("Fig. 2c: on-axis signal over noise", _Z, "SNR of one pixel, one photon", False,
-                ("snr",)),
+    "2c": Panel("Fig. 2c: on-axis signal over noise", _Z, "SNR, one photon", False, ("snr",)),
     "2d": Panel("Fig. 2d: transverse precision", _Z, "σ of x, one photon [nm]", True, ("x",), 0),
-    "2e": Panel("Fig. 2e: axial precision", _Z, "σ of z, one photon [nm]", True, ("z",), 2),
-    "3": Panel("Fig. 3: mass", _F, _MASS, True, ("mass", "mass joint"), 3),
-    "4a": Panel("Fig. 4a: axial precision, COBRI attenuated", _Z, "σ of z, one photon [nm]", True,
-                ("z",), 2, True),
-    "4b": Panel("Fig. 4b: axial precision, iSCAT attenuated", _Z, "σ of z, one photon [nm]", True,
-                ("z",), 2, True),
+    "2e": Panel("Fig. 2e: axial precision", _Z, _AXIAL, True, ("z",), 2),
+    "3": Panel("Fig. 3: mass", _F, _MASS, True, _TWO, 3),
+    "4a": Panel("Fig. 4a: axial precision, COBRI attenuated", _Z, _AXIAL, True, ("z",), 2, True),
+    "4b": Panel("Fig. 4b: axial precision, iSCAT attenuated", _Z, _AXIAL, True, ("z",), 2, True),
     "4c": Panel("Fig. 4c: mass, COBRI attenuated", _F, _MASS, True, ("mass",), 3, True),
     "4d": Panel("Fig. 4d: mass, iSCAT attenuated", _F, _MASS, True, ("mass",), 3, True),
-}  # fmt: skip
+}
 """D21's panels but 2a."""
 
 QUANTITY_LABELS = {
@@ -266,9 +260,12 @@ WAYS = {
 
 PAPER_FILES = frozenset(
     {"comparison.html", "comparison.csv"}
-    | {f"{stem}.{end}" for stem in [*(f"fig_{p}" for p in PANELS), "fig_2a", "table_1"]
-       for end in ("png", "svg", "csv")}
-)  # fmt: skip
+    | {
+        f"{stem}.{end}"
+        for stem in ("table_1", "fig_2a", *(f"fig_{panel}" for panel in PANELS))
+        for end in ("png", "svg", "csv")
+    }
+)
 """What `write_paper` leaves in its folder."""
 
 _NOTES = (
@@ -349,18 +346,14 @@ def _images_table(images: Mapping[tuple[str, float], FloatArray], field_nm: floa
     parts = []
     for (scheme, z), image in images.items():
         axis = (np.arange(image.shape[0]) - (image.shape[0] - 1) / 2) * field_nm / image.shape[0]
-        part = pd.DataFrame(image, columns=[f"x={x:.2f}" for x in axis])
-        part.insert(0, "y_nm", axis)
-        part.insert(0, "z_nm", z)
-        part.insert(0, "scheme", scheme)
-        parts.append(part)
+        place = pd.DataFrame({"scheme": scheme, "z_nm": z, "y_nm": axis})
+        parts.append(place.join(pd.DataFrame(image, columns=[f"x={x:.2f}" for x in axis])))
     return pd.concat(parts, ignore_index=True)
 
 
 def _sections(table: pd.DataFrame, drawn: Mapping[str, Markup]) -> list[Section]:
     exact = table.set_index("quantity")["exact"]
-    printed = {"x": (71, "x"), "y": (57, "y"), "z_iscat": (18, "z, iSCAT"),
-               "z_cobri": (114, "z, COBRI")}  # fmt: skip
+    printed = {"x": 71, "y": 57, "z_iscat": 18, "z_cobri": 114}
     columns = (
         worded("Quantum bound of one photon", lambda row: QUANTITY_LABELS[row["quantity"]]),
         *(numeric(label, of(key, float)) for key, label in WAYS.items()),
@@ -373,8 +366,8 @@ def _sections(table: pd.DataFrame, drawn: Mapping[str, Markup]) -> list[Section]
             "to the printed digits; the rest says what the formulas give when they are integrated "
             "exactly, and when the photons are counted as the camera counts them.",
             facts=[
-                Fact(label, f"{exact[key]:.1f}", "nm", f"printed: {value}")
-                for key, (value, label) in printed.items()
+                Fact(QUANTITY_LABELS[key][5:-5], f"{exact[key]:.1f}", "nm", f"printed: {value}")
+                for key, value in printed.items()
             ],
             charts=[Chart("chart-1", "Five ways to compute Table 1", drawn["table_1"], wide=True)],
             tables=[tabulate(table.to_dict("records"), columns, "Table 1, five ways")],
@@ -392,36 +385,24 @@ def _sections(table: pd.DataFrame, drawn: Mapping[str, Markup]) -> list[Section]
     return sections
 
 
-@dataclass(frozen=True)
-class Curve:
-    """One curve of a panel."""
-
-    name: str
-    x: FloatArray
-    y: FloatArray
-    style: dict[str, Any]
-
-
-def curves_of(panel: str, rows: pd.DataFrame, convention: str) -> list[Curve]:
-    """Gather the curves of a panel."""
+def curves_of(panel: str, rows: pd.DataFrame, convention: str) -> list[tuple[pd.DataFrame, Style]]:
+    """Gather the curves of a panel, and how each is drawn."""
     spec, found = PANELS[panel], []
     rows = rows[(rows["convention"] == convention) & rows["quantity"].isin(spec.quantities)]
     key = "attenuation" if spec.by_attenuation else "scheme"
     if spec.by_attenuation:
         rows = rows.sort_values("attenuation", ascending=False, kind="stable")
-    for number, ((first, quantity), group) in enumerate(
-        rows.groupby([key, "quantity"], sort=False)
-    ):
+    shades = iter(SHADES)
+    for (first, quantity), group in rows.groupby([key, "quantity"], sort=False):
         joint = str(quantity).endswith("joint")
         if joint and first != "iscat":
             continue  # as in D21; the CSV has all three
         if not spec.by_attenuation:
             name, color = SCHEMES[first].title, SCHEME_COLORS[first]
         else:
-            name, color = (f"β = {first:g}", SHADES[number]) if first else ("dark field", GREY)
+            name, color = (f"β = {first:g}", next(shades)) if first else ("dark field", GREY)
         name = f"{name}, with z unknown" if joint else name
-        style: Style = {"color": color, "alpha": 0.55 if joint else 1.0}
-        found.append(Curve(name, group["x"].to_numpy(float), group["value"].to_numpy(float), style))
+        found.append((group, {"color": color, "alpha": 0.55 if joint else 1.0, "label": name}))
     return found
 
 
@@ -435,12 +416,9 @@ def limits_of(
     if spec.bound != 2:
         return [("quantum bound", float(quantum[convention, "iscat"][spec.bound]), GREY)]
     schemes = {"4a": ("cobri",), "4b": ("iscat",)}.get(panel, ("iscat", "cobri"))
+    colors = dict.fromkeys(schemes, GREY) if spec.by_attenuation else SCHEME_COLORS
     return [
-        (
-            f"quantum bound, {SCHEMES[s].title}",
-            float(quantum[convention, s][2]),
-            GREY if spec.by_attenuation else SCHEME_COLORS[s],
-        )
+        (f"quantum bound, {SCHEMES[s].title}", float(quantum[convention, s][2]), colors[s])
         for s in schemes
     ]
 
@@ -452,13 +430,13 @@ def panel_figure(
     spec = PANELS[panel]
     figure = new_figure(8.2, 4.8)
     top, low = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
-    for authors, exact in zip(
-        curves_of(panel, rows, "dong2021"), curves_of(panel, rows, "exact"), strict=True
-    ):
-        top.plot(exact.x, exact.y, lw=1.6, label=exact.name, **exact.style)
-        top.plot(authors.x, authors.y, "--", lw=1.1, **exact.style)
-        apart = exact.y / authors.y if spec.log else exact.y - authors.y
-        low.plot(exact.x, apart, lw=1.3, **exact.style)
+    both = (curves_of(panel, rows, convention) for convention in ("dong2021", "exact"))
+    for (authors, _), (exact, style) in zip(*both, strict=True):
+        theirs, ours = (curve["value"].to_numpy(float) for curve in (authors, exact))
+        top.plot(exact["x"], ours, lw=1.6, **style)
+        unnamed: Style = {**style, "label": None}
+        top.plot(authors["x"], theirs, "--", lw=1.1, **unnamed)
+        low.plot(exact["x"], ours / theirs if spec.log else ours - theirs, lw=1.3, **unnamed)
     for convention, dots in (("exact", (1.5, 2)), ("dong2021", (1.5, 6))):
         for name, value, color in limits_of(panel, quantum, convention):
             label = name if convention == "exact" else None
@@ -508,12 +486,10 @@ def images_figure(images: Mapping[tuple[str, float], FloatArray], field_nm: floa
 
 def table_figure(table: pd.DataFrame) -> Figure:
     """Draw Table 1."""
-    figure = new_figure(7.4, 3.0)
-    axes = figure.subplots()
+    figure, axes = one_panel(7.4, 3.0)
     rows = table[table["unit"] == "nm"]
-    marks = {"printed": ("s", GREY), "authors": ("x", GREY), "dong2021": ("+", INK),
-             "exact": ("o", BLUE), "reciprocal": ("D", VERMILLION)}  # fmt: skip
-    for number, (key, (mark, color)) in enumerate(marks.items()):
+    colors = (GREY, GREY, INK, BLUE, VERMILLION)
+    for number, (key, mark, color) in enumerate(zip(WAYS, "sx+oD", colors, strict=True)):
         at = np.arange(len(rows)) + 0.13 * (number - 2)
         axes.plot(rows[key], at, mark, color=color, label=WAYS[key], ms=6, mew=1.4)
     for y, (printed, exact) in enumerate(zip(rows["printed"], rows["exact"], strict=True)):

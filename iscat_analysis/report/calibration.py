@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from iscat_analysis.optics.measured import Template
 from iscat_analysis.report.numbers import (
-    Column,
     Fact,
     Table,
     decimals_for,
     fixed,
+    intervals,
     number,
     numeric,
+    of,
     percent,
     sentence,
     tabulate,
@@ -44,11 +44,12 @@ from iscat_analysis.report.style import (
     Style,
     around,
     floats,
-    new_figure,
+    one_panel,
     picture,
     publish,
     row_of_panels,
     whiskers,
+    whole_numbers,
 )
 from iscat_analysis.units import count
 
@@ -169,12 +170,12 @@ def _camera_facts(found: Mapping[str, Any]) -> list[Fact]:
         ("offset_adu", "Offset", "counts"),
         ("read_noise_e", "Read noise", "e"),
     ):
-        estimate = found[key]
+        estimate, below = found[key], found.get(key.replace("noise", "noise_below"))
+        if estimate is None and below is None:
+            facts.append(Fact(label, "—", note="not identifiable"))
+            continue
         if estimate is None:
-            below = found["read_noise_below_e"] if key == "read_noise_e" else None
-            unknown = Fact(label, "—", note="not identifiable")
-            limit = Fact(label, f"< {number(below)}", unit, "95 %")
-            facts.append(unknown if below is None else limit)
+            facts.append(Fact(label, f"< {number(below)}", unit, "95 %"))
             continue
         low, high = estimate["ci95"]
         value, ends = with_interval(estimate["value"], low, high)
@@ -189,7 +190,7 @@ def _camera_facts(found: Mapping[str, Any]) -> list[Fact]:
 def _camera_figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     curve, noise = found["photon_transfer"], found["noise"]
     if curve.get("mean_adu"):
-        figure, axes = _single()
+        figure, axes = one_panel(6.2, 3.4)
         axes.plot(curve["mean_adu"], floats(curve["fit_adu2"]), color=INK, label="fit")
         variance, reach = floats(curve["variance_adu2"]), 1.96 * floats(curve["variance_se"])
         style: Style = {"ms": 3, "color": VERMILLION, "label": "pixels, 95 %"}
@@ -198,18 +199,13 @@ def _camera_figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
         axes.legend()
         yield "transfer", figure
     if noise.get("n_frames"):
-        figure, axes = _single()
+        figure, axes = one_panel(6.2, 3.4)
         axes.plot(noise["n_frames"], floats(noise["shot_noise"]), color=INK, label="shot noise")
         dots: Style = {"color": VERMILLION, "ms": 4, "label": "measured"}
         axes.plot(noise["n_frames"], noise["contrast_noise"], "o", **dots)
         axes.set(xscale="log", yscale="log", xlabel="frames averaged", ylabel="contrast noise")
         axes.legend()
         yield "averaging", figure
-
-
-def _single(width: float = 6.2, height: float = 3.4) -> tuple[Figure, Axes]:
-    figure = new_figure(width, height)
-    return figure, figure.add_subplot()
 
 
 # ---- Standards -----------------------------------------------------------------------------------
@@ -224,14 +220,11 @@ def mass_page(title: str, found: Mapping[str, Any], toml: str) -> str:
     )
     gradient, offset = number(found["gradient_per_kda"]), number(found["offset"])
     largest = max(abs(s["residual_percent"]) for s in standards)
+    freedom = f"{count(found['dof'], 'degree')} of freedom"
     facts = [
         Fact("Gradient", gradient, "per kDa", f"± {number(found['gradient_se'], 2)}"),
         Fact("Offset", offset, note=f"± {number(found['offset_se'], 2)}"),
-        Fact(
-            "χ² of the line",
-            number(found["chi2"]),
-            note=f"{count(found['dof'], 'degree')} of freedom",
-        ),
+        Fact("χ² of the line", number(found["chi2"]), note=freedom),
         Fact("Largest residual", number(largest, 2), "%"),
     ]
     charts, tables = _charts(_mass_figures(found)), [_standards_table(standards)]
@@ -252,7 +245,7 @@ def _mass_figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     (vs, cov), (_, vo) = found["covariance"]
     line = sign * (found["gradient_per_kda"] * grid + found["offset"])
     band = 1.96 * np.sqrt(np.maximum(grid**2 * vs + 2 * grid * cov + vo, 0.0))
-    figure, axes = _single()
+    figure, axes = one_panel(6.2, 3.4)
     axes.plot(grid, line, color=INK, label="line, 95 %")
     axes.fill_between(grid, line - band, line + band, color=GREY, alpha=0.35, lw=0)
     style: Style = {"color": VERMILLION, "label": "standards, 95 %"}
@@ -260,37 +253,32 @@ def _mass_figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     axes.set(xlabel="mass [kDa]", ylabel="|contrast|")
     axes.legend()
     yield "standards", figure
-    figure, axes = _single()
+    figure, axes = one_panel(6.2, 3.4)
     axes.stairs(histogram["counts"], histogram["edges"], fill=True, color=GREY, label="events")
     for k, contrast in enumerate(contrasts):
         axes.axvline(contrast, color=VERMILLION, ls="--", label=None if k else "standards")
-    axes.set(xlabel="|contrast|", ylabel="events")
-    axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
+    whole_numbers(axes, "|contrast|")
     axes.legend()
     yield "peaks", figure
 
 
 def _standards_table(standards: list[Mapping[str, Any]]) -> Table:
     """Set every standard beside the line; contrasts in thousandths, so that they line up."""
-    errors = decimals_for(1e3 * s["contrast_se"] for s in standards)
-    reach = decimals_for((s["high_kda"] - s["low_kda"]) / 2 for s in standards)
+    errors = decimals_for(s["contrast_se"] for s in standards) - 3
     known = decimals_for([s["mass_se"] for s in standards])
 
-    def column(label: str, name: str, decimals: int, scale: float = 1.0) -> Column:
-        return numeric(label, lambda s: fixed(scale * s[name], decimals))
+    def thousandths(value: float) -> str:
+        return fixed(1e3 * value, max(errors, 0))
 
     columns = (
-        column("mass [kDa]", "mass_kda", known),
-        column("its error [kDa]", "mass_se", known),
-        column("contrast [10⁻³]", "contrast", errors, 1e3),
-        column("its error", "contrast_se", errors, 1e3),
-        column("width", "width", errors, 1e3),
-        column("events", "count", 0),
-        column("by the line [kDa]", "found_kda", reach),
-        column("residual [%]", "residual_percent", 2),
-        numeric(
-            "95 % [kDa]", lambda s: f"{fixed(s['low_kda'], reach)} to {fixed(s['high_kda'], reach)}"
-        ),
+        numeric("mass [kDa]", of("mass_kda", fixed, known)),
+        numeric("its error [kDa]", of("mass_se", fixed, known)),
+        numeric("contrast [10⁻³]", of("contrast", thousandths)),
+        numeric("its error", of("contrast_se", thousandths)),
+        numeric("width", of("width", thousandths)),
+        numeric("events", of("count", fixed, 0)),
+        *intervals("by the line [kDa]", "found_kda", ("low_kda", "high_kda")),
+        numeric("residual [%]", of("residual_percent", fixed, 2)),
     )
     caption = "Standards, and what the line makes of their peaks, with 95 % prediction intervals"
     return tabulate(standards, columns, caption)
@@ -363,7 +351,7 @@ def _name_axes(panels: Sequence[Axes], x: str, y: str) -> None:
 
 
 def _radial(pictures: Mapping[str, Any]) -> Figure:
-    figure, axes = _single(4.6, 3.0)
+    figure, axes = one_panel(4.6, 3.0)
     radius, mean, se = (np.array(pictures[k]) for k in ("radius_nm", "radial", "radial_se"))
     axes.plot(radius, pictures["radial_model"], color=BLUE, label="model")
     style: Style = {"fmt": ".", "color": VERMILLION, "label": "measured, 95 %"}
@@ -374,15 +362,14 @@ def _radial(pictures: Mapping[str, Any]) -> Figure:
 
 
 def _p_values(p_values: list[float]) -> Figure:
-    figure, axes = _single(4.6, 3.0)
+    figure, axes = one_panel(4.6, 3.0)
     axes.hist(p_values, bins=10, range=(0.0, 1.0), color=VERMILLION)
-    axes.set(xlabel="p-value", ylabel="pictures")
-    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+    whole_numbers(axes, "p-value", "pictures")
     return figure
 
 
 def _correlation(names: list[str], correlation: list[list[float]]) -> Figure:
-    figure, axes = _single(4.6, 3.8)
+    figure, axes = one_panel(4.6, 3.8)
     matrix = np.asarray(correlation, dtype=float).reshape(len(names), len(names))
     shown = axes.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1)
     labels = [_LABELS.get(name, (name, ""))[0].split(",")[0] for name in names]
@@ -393,17 +380,14 @@ def _correlation(names: list[str], correlation: list[list[float]]) -> Figure:
 
 
 def _parameters(parameters: list[Mapping[str, Any]]) -> Table:
-    def named(row: Mapping[str, Any]) -> tuple[str, str]:
-        return _LABELS.get(row["parameter"], (row["parameter"], ""))
-
     columns = (
-        worded("parameter", lambda row: named(row)[0]),
-        numeric("value", lambda row: number(row["value"], 6)),
-        numeric("standard error", lambda row: number(row["sigma"])),
-        numeric("CRB", lambda row: number(row["crb"])),
-        numeric("as configured", lambda row: number(row["configured"], 6)),
-        worded("unit", lambda row: named(row)[1]),
-        worded("state", lambda row: _STATES[row["state"]]),
+        worded("parameter", of("parameter", lambda name: _LABELS.get(name, (name, ""))[0])),
+        numeric("value", of("value", number, 6)),
+        numeric("standard error", of("sigma")),
+        numeric("CRB", of("crb")),
+        numeric("as configured", of("configured", number, 6)),
+        worded("unit", of("parameter", lambda name: _LABELS.get(name, ("", ""))[1])),
+        worded("state", of("state", _STATES.get)),
     )
     return tabulate(parameters, columns, "Parameters of the optics")
 
@@ -443,10 +427,8 @@ def _template_figures(found: Mapping[str, Any], template: Template) -> Iterator[
     half = template.contrast.shape[0] * template.step_nm / 2000
     figure, panels = row_of_panels(2, 3.1, 2.9)
     picture(panels[0], template.contrast, half, (-1.0, 1.0), "contrast")
-    top = float(template.sigma.max())
-    picture(
-        panels[1], template.sigma, half, (0.0, top), "standard deviation", style={"cmap": "cividis"}
-    )
+    ends, grown = (0.0, float(template.sigma.max())), {"cmap": "cividis"}
+    picture(panels[1], template.sigma, half, ends, "standard deviation", style=grown)
     _name_axes(panels, "x [µm]", "y [µm]")
     yield "template", figure
     yield "held-out", _p_values(found["held_out"]["p_values"])

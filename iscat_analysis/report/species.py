@@ -77,9 +77,7 @@ def distribution_section(found: Mapping[str, Any], figures: Mapping[str, Markup]
         numeric("landing", of("landing", fixed, 0)),
         numeric("leaving", of("leaving", fixed, 0)),
         numeric("detected", of("efficiency", percent, 1), "chance to detect such a particle"),
-        *intervals(
-            "came", "count_corrected", _CORRECTED, title="and those that were missed"
-        ),
+        *intervals("came", "count_corrected", _CORRECTED, title="and those that were missed"),
         *intervals("fraction", "fraction", in_percent=True, title="of the particles that came"),
     )
     title = f"Species by mass; intervals from {found['draws']} simulated repetitions"

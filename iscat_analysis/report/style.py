@@ -234,10 +234,10 @@ def judged(
             yield part, color if name == "ok" else PURPLE, name
 
 
-def whole_numbers(axes: Axes, x_label: str = "", y_label: str = "events", most: int = 5) -> None:
+def whole_numbers(axes: Axes, x_label: str, y_label: str = "events") -> None:
     """Name the axes of a histogram, whose numbers are whole."""
     axes.set(xlabel=x_label, ylabel=y_label)
-    axes.yaxis.set_major_locator(MaxNLocator(most, integer=True))
+    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
 def whiskers(
