@@ -206,9 +206,8 @@ def label_of(analysis: Analysis, name: str) -> str:
 
 def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
     """Convert masses to contrasts, for a scale that is proportional to the mass."""
-    per_kda = (table["contrast"] / table["mass_kda"]).abs()
-    columns = [name for kind in ("sigma", "crb", "qcrb") if (name := f"{kind}_mass_kda") in table]
-    scaled = {name: table[name] * per_kda for name in columns}
+    errors = table.columns.intersection([f"{kind}_mass_kda" for kind in ("sigma", "crb", "qcrb")])
+    scaled = table[errors].mul((table["contrast"] / table["mass_kda"]).abs(), axis=0)
     if "systematic_contrast" in table:
         scaled["systematic_mass_kda"] = table["systematic_contrast"]
     return table.assign(**scaled, mass_kda=table["contrast"])
@@ -216,9 +215,8 @@ def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
 
 def as_diameters(table: pd.DataFrame) -> pd.DataFrame:
     """Put the diameters of spheres in the place of their masses."""
-    kinds = ("sigma", "crb", "qcrb", "systematic")
-    names = [name for kind in kinds if (name := f"{kind}_mass_kda") in table]
-    sizes = {name: table[name.replace("mass_kda", "diameter_nm")] for name in names}
+    masses = [name for name in table if str(name).endswith("_mass_kda")]
+    sizes = {name: table[name.replace("mass_kda", "diameter_nm")] for name in masses}
     return table.assign(**sizes, mass_kda=table["diameter_nm"])
 
 
@@ -327,7 +325,7 @@ def quartiles(values: FloatArray) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class Precision:
-    """σ of one parameter and its bounds, over the rows that are ok."""
+    """σ of one parameter and its bounds, over the rows that are ok; medians, NaN if unknown."""
 
     name: str
     events: int
@@ -348,43 +346,42 @@ class Precision:
         return math.isfinite(self.measured)
 
     @property
+    def best(self) -> tuple[str, float]:
+        """Name and value of the bound of all measurements: Holevo's, where it is known."""
+        return ("Holevo", self.holevo) if math.isfinite(self.holevo) else ("QCRB", self.qcrb)
+
+    @property
     def measured_text(self) -> str:
         """The measured spread over the bound with its interval."""
         low, high = self.measured_ci95
         return f"{fixed(self.measured, 2)} ({fixed(low, 2)} to {fixed(high, 2)})"
 
-    @property
-    def shared(self) -> str:
-        """The error that all events share, as text; empty where it is not known."""
-        known = math.isfinite(self.systematic)
-        return f", common to all events {number(self.systematic)}" if known else ""
-
 
 def precision_of(analysis: Analysis, table: pd.DataFrame, name: str) -> Precision:
     """Set σ of one parameter beside its bounds."""
     good = _good(table)
+    shared = good.get(f"systematic_{name}", pd.Series(dtype=float)).to_numpy(float)
     sigma, crb, qcrb = (good[f"{kind}_{name}"].to_numpy(float) for kind in ("sigma", "crb", "qcrb"))
     usable = np.isfinite(sigma) & np.isfinite(crb) & (crb > 0)
     sigma, crb, qcrb = sigma[usable], crb[usable], qcrb[usable]
     medians = analysis.summary.get("precision", {}).get(name, {})
-    holevo, measured = medians.get("holevo_median"), medians.get("repeat_over_crb")
-    known = measured is not None
-    shared = good.get(f"systematic_{name}", pd.Series(dtype=float)).to_numpy(float)
+    known = {key: value for key, value in medians.items() if value is not None}
+    in_all = "holevo_median" in known
     return Precision(
         name=name,
-        events=int(usable.sum()),
+        events=sigma.size,
         sigma=quartiles(sigma)[1],
         crb=quartiles(crb)[1],
         qcrb=quartiles(qcrb)[1],
-        holevo=math.nan if holevo is None else holevo,
+        holevo=known.get("holevo_median", math.nan),
         over_crb=quartiles(sigma / crb)[1],
-        information=quartiles((qcrb / crb) ** 2)[1]
-        if holevo is None
-        else medians["information_fraction_median"],
+        information=medians["information_fraction_median"]
+        if in_all
+        else quartiles((qcrb / crb) ** 2)[1],
         systematic=quartiles(shared)[1],
-        measured=measured if known else math.nan,
-        measured_ci95=tuple(medians["repeat_over_crb_ci95"]) if known else (math.nan, math.nan),
-        whole=known and medians["repeat_whole"],
+        measured=known.get("repeat_over_crb", math.nan),
+        measured_ci95=tuple(known.get("repeat_over_crb_ci95", (math.nan, math.nan))),
+        whole=known.get("repeat_whole", False),
     )
 
 
@@ -440,7 +437,7 @@ def headline(analysis: Analysis, table: pd.DataFrame) -> list[str]:
     lines = [*spread_lines(analysis, found), *not_a_mass(analysis)]
     judged = found if kind is EVENTS_KIND else tracks
     rows, flagged = tally(judged), caution(judged, kind)
-    parts = [fact.text for fact in answers(analysis, found)] if flagged is None else []
+    parts = [] if flagged is not None else [fact.text for fact in answers(analysis, found)]
     ok = f"{rows.ok if rows.flagged else 'all'} of them ok."
     if kind is TRACKS_KIND:
         text = f"{count(rows.number, 'track')} of {positions}, {ok}"
@@ -451,34 +448,34 @@ def headline(analysis: Analysis, table: pd.DataFrame) -> list[str]:
         return [text, *lines]
     if flagged is not None:
         return [sentence(flagged.text), *lines]
-    text = f"{count(rows.number, 'event')}, {ok}"
-    text = (
-        "One event, and it is ok."
-        if rows.number == 1
-        else " ".join([text, *(f"{t}." for t in parts)])
-    )
+    text = " ".join([f"{count(rows.number, 'event')}, {ok}", *(f"{part}." for part in parts)])
+    if rows.number == 1:
+        text = "One event, and it is ok."
     return [text, *_against_bounds(analysis, found), *lines]
 
 
 def _against_bounds(analysis: Analysis, table: pd.DataFrame) -> list[str]:
     """Compare σ of the mass, or else of the height, with the bounds."""
-    name = main_parameter(analysis)
+    name, good = main_parameter(analysis), _good(table)
     p = precision_of(analysis, table, name)
     if not p.events:
         return []
-    of_it, sigma = LABELS[name], f"{number(p.sigma)} {UNITS[name]}"
-    shared = f"{number(p.systematic)} {UNITS[name]}" if math.isfinite(p.systematic) else ""
+    of_it = LABELS[name]
+    sigma, shared = (f"{number(value)} {UNITS[name]}" for value in (p.sigma, p.systematic))
+    is_shared = math.isfinite(p.systematic)
     if is_uncalibrated(analysis):
-        good = _good(table)
-        of_it = "contrast"
-        relative = (good["sigma_mass_kda"] / good["mass_kda"].abs()).to_numpy(float)
-        sigma = f"{percent(quartiles(relative)[1])} of it"
-        if "systematic_contrast" in good:
-            relative = (good["systematic_contrast"] / good["contrast"].abs()).to_numpy(float)
-            shared = f"{percent(quartiles(relative)[1])} of it"
+        of_it, is_shared = "contrast", "systematic_contrast" in good
+        errors = good.get("systematic_contrast", good["contrast"] * math.nan)
+        sigma, shared = (
+            f"{percent(quartiles((error / whole.abs()).to_numpy(float))[1])} of it"
+            for error, whole in (
+                (good["sigma_mass_kda"], good["mass_kda"]),
+                (errors, good["contrast"]),
+            )
+        )
     text = f"σ of the {of_it}, from the curvature of the likelihood, is {sigma}"
     text += f", {number(p.over_crb)} times the Cramér–Rao bound"
-    if shared:
+    if is_shared:
         text += f"; the error common to all events is {shared}"
     if math.isfinite(p.information):
         of = "can be had of the light" if math.isfinite(p.holevo) else "is in the light"
@@ -492,9 +489,7 @@ def spread_lines(analysis: Analysis, table: pd.DataFrame) -> list[str]:
     name, lines = main_parameter(analysis), []
     p = precision_of(analysis, table, name)
     if message:
-        lines.append(
-            f"{message if message.startswith('σ') else message[:1].upper() + message[1:]}."
-        )
+        lines.append(sentence(message) if message[:1] != "σ" else f"{message}.")
     elif p.is_measured:
         where = "between parts of each event's frames; slower noise does not show there"
         if p.whole:

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup, escape
 
-from iscat_analysis.findings import Finding, Severity
+from iscat_analysis.findings import Severity
 from iscat_analysis.records import (
     EVENTS,
     PARAMETERS,
@@ -64,8 +64,10 @@ from iscat_analysis.report.numbers import (
     fixed,
     number,
     numeric,
+    of,
     percent,
     tabulate,
+    with_interval,
     worded,
 )
 from iscat_analysis.report.page import Section, render_page
@@ -91,13 +93,6 @@ _SIGNS = {
     "mass_kda": "Negative masses are particles that leave.",
     "contrast": "Dark particles that land, and bright ones that leave, have negative contrast.",
 }
-_TRACK_COLUMNS = (
-    "n_frames", "x_nm", "y_nm", "z_nm", "mass_kda", "sigma_mass_kda", "crb_mass_kda",
-    "systematic_mass_kda", "optical_diameter_nm", "sigma_optical_diameter_nm", "d_um2_s",
-    "sigma_d_um2_s", "crb_d_um2_s", "diameter_nm", "sigma_diameter_nm",
-    "refractive_index", "sigma_refractive_index", "exponent", "p_confinement", "p_anomalous",
-    "p_steady", "confinement_nm", "mass_scatter",
-)  # fmt: skip
 _DECIMALS = {
     **dict.fromkeys(("chi2_reduced", "p_value", "exponent", "p_confinement", "p_anomalous"), 2),
     **dict.fromkeys(("p_steady", "mass_scatter"), 2),
@@ -185,17 +180,19 @@ def page_context(
     rows, facts, cells = _SHOWN[kind](analysis, table)
     images = event_details(analysis, rows)
     sampled = [view for view in analysis.views if view.posterior is not None]
-    started = _when(analysis.provenance.started)
+    started, title = _when(analysis.provenance.started), analysis.scheme_kind.title
+    title = title.capitalize() if title.islower() else title
     cautions, lines = not_a_mass(analysis), headline(analysis, table)
     free = free_parameters(analysis.mode, table)
     precision = [precision_of(analysis, table, name) for name in free]
-    left_out = 0 < len(images) < len(rows)
-    findings = sorted(analysis.findings, key=_rank)
+    kept = f"images of the first {len(images)} of {len(rows)} rows"
+    left_out = f"To keep this page small it holds the {kept}." if len(images) < len(rows) else ""
+    ranks = list(Severity)
+    findings = sorted(analysis.findings, key=lambda f: -ranks.index(f.severity))
     species = _species(analysis, table)
     context: dict[str, Any] = {
         "title": PurePath(source.replace("\\", "/")).name or "Analysis",
-        "subtitle": f"{_scheme(analysis)}, mode {analysis.mode}: {_MODES[analysis.mode]}. "
-        f"{started}".rstrip(),
+        "subtitle": f"{title}, mode {analysis.mode}: {_MODES[analysis.mode]}. {started}".rstrip(),
         "footer": "iscat-analysis "
         f"{analysis.provenance.versions.get('iscat-analysis', '')}, {started}".rstrip(", "),
         "tracked": kind is TRACKS_KIND,
@@ -206,7 +203,6 @@ def page_context(
         "tiles": facts,
         "totals": f"{tally(rows).text(kind.noun)}.",
         "precision": _precision_table(analysis, precision),
-        "has_measured": any(p.is_measured for p in precision),
         "has_holevo": any(math.isfinite(p.holevo) for p in precision),
         "budget": _budget_table(analysis),
         "spread_lines": species_widths(analysis.summary),
@@ -217,10 +213,7 @@ def page_context(
         "events": _openable(kind, rows, cells),
         "has_traces": any(detail.trace for detail in images.values()),
         "images": {str(row): list(packed) for row, packed in images.items()},
-        "embedding_note": f"To keep this page small it holds the images of the first {len(images)} "
-        f"of {len(rows)} rows."
-        if left_out
-        else None,
+        "embedding_note": left_out,
         "films": list(films_shown(analysis, folder)),
         "track_lines": list(track_lines(analysis.summary)),
         "posterior": _posterior_table(sampled, table),
@@ -245,16 +238,6 @@ def page_context(
         ("provenance", "Provenance", True),
     )
     return {**context, "nav": [(name, title) for name, title, shown in parts if shown]}
-
-
-def _rank(finding: Finding) -> int:
-    """Sort findings by severity, the most severe first."""
-    return -list(Severity).index(finding.severity)
-
-
-def _scheme(analysis: Analysis) -> str:
-    title = analysis.scheme_kind.title
-    return title[:1].upper() + title[1:] if title.islower() else title
 
 
 def _provenance(analysis: Analysis) -> list[tuple[str, Any]]:
@@ -297,8 +280,10 @@ def _facts(analysis: Analysis, table: pd.DataFrame) -> list[Fact]:
     if not (p := precision_of(analysis, table, name)).events:
         return facts
     label, unit = LABELS[name], UNITS[name]
-    best, bound = ("Holevo", p.holevo) if math.isfinite(p.holevo) else ("QCRB", p.qcrb)
-    sigma = f"σ {number(p.sigma)}{p.shared}, CRB {number(p.crb)} {unit}"
+    best, bound = p.best
+    known = math.isfinite(p.systematic)
+    shared = f", common to all events {number(p.systematic)}" if known else ""
+    sigma = f"σ {number(p.sigma)}{shared}, CRB {number(p.crb)} {unit}"
     beside = f", {best} {number(bound)} {unit}"
     if is_uncalibrated(analysis):
         label, sigma, beside = "contrast", "median of the events' own ratios", ""
@@ -332,51 +317,43 @@ def _precision_table(analysis: Analysis, precision: Sequence[Precision]) -> Tabl
     )
     has_holevo = any(math.isfinite(p.holevo) for p in precision)
     columns = [
-        worded("Medians", lambda p: f"{label_of(analysis, p.name)} [{UNITS[p.name]}]"),
-        numeric(
-            "σ",
-            lambda p: number(p.sigma),
-            "standard deviation, from the curvature of the likelihood at its maximum",
-        ),
+        worded("Medians", lambda p: f"{label_of(analysis, p['name'])} [{UNITS[p['name']]}]"),
+        numeric("σ", of("sigma"), "from the curvature of the likelihood at its maximum"),
         numeric(
             "common",
-            lambda p: number(p.systematic),
+            of("systematic"),
             "error that all events of the movie share, from calibrations; not part of σ, and not "
             "lessened by averaging",
         ),
         numeric(
             "CRB",
-            lambda p: number(p.crb),
+            of("crb"),
             "classical Cramér–Rao bound: the best any unbiased estimator can do with these images",
         ),
         numeric(
             "Holevo",
-            lambda p: number(p.holevo),
+            of("holevo"),
             "the best that one measurement of the collected light can do for all free parameters "
             "at once",
         ),
         numeric(
             "QCRB",
-            lambda p: number(p.qcrb),
+            of("qcrb"),
             "quantum Cramér–Rao bound: the best any measurement can do with the collected light",
         ),
-        numeric(
-            "σ / CRB",
-            lambda p: number(p.over_crb),
-            "median of the events' own ratios; near 1 by construction",
-        ),
+        numeric("σ / CRB", of("over_crb"), "median of the rows' ratios; near 1 by construction"),
         numeric(
             "measured / CRB",
-            lambda p: p.measured_text if p.is_measured else "—",
+            of("measured_text"),
             f"measured spread over the bound, with its 95 % interval: {where}",
         ),
         numeric(
             "light used",
-            lambda p: percent(p.information),
+            of("information", percent),
             f"({'Holevo' if has_holevo else 'QCRB'} / CRB) squared: the share that the images "
             "carry of what can be had of the light's information",
         ),
-        numeric(kind.unit, lambda p: str(p.events)),
+        numeric(kind.unit, "events"),
     ]
     known = {
         "common": any(math.isfinite(p.systematic) for p in precision),
@@ -384,8 +361,11 @@ def _precision_table(analysis: Analysis, precision: Sequence[Precision]) -> Tabl
         "measured / CRB": any(p.is_measured for p in precision),
     }
     columns = [column for column in columns if known.get(column.label, True)]
+    rows = [
+        {**vars(p), "measured_text": p.measured_text if p.is_measured else None} for p in precision
+    ]
     caption = f"{kind.fits} whose status is ok; units in the first column"
-    return replace(tabulate(precision, columns, caption), sortable=False)
+    return replace(tabulate(rows, columns, caption), sortable=False)
 
 
 def _budget_table(analysis: Analysis) -> Table:
@@ -393,27 +373,25 @@ def _budget_table(analysis: Analysis) -> Table:
     budget = list(analysis.summary.get("budget", ()))
     shared = [one for one in budget if one["sigma_rel"] and one["common"]]
     if len(shared) > 1:
-        whole: dict[str, Any] = {
-            key: math.sqrt(sum(one[key] ** 2 for one in shared))
-            for key in ("sigma_mass_kda", "sigma_rel")
-        }
-        whole |= {"name": "all that is shared", "kind": "", "common": True, "dof": None}
-        budget.append({**whole, "remedy": ""})
+        sigma, share = (
+            math.hypot(*(one[key] for one in shared)) for key in ("sigma_mass_kda", "sigma_rel")
+        )
+        whole = {"name": "all that is shared", "kind": "", "common": True, "dof": None}
+        budget.append({**whole, "sigma_mass_kda": sigma, "sigma_rel": share, "remedy": ""})
+
+    def rows(common: bool) -> str:
+        return "all rows" if common else ""
+
+    def freedom(dof: float | None) -> str:
+        return "" if dof is None else f"{dof:.0f}"
+
     columns = [
         worded("source", "name"),
         worded("known by", "kind", "measured, learned from pictures, or assumed"),
-        worded(
-            "shared",
-            lambda one: "all rows" if one["common"] else "",
-            "shared by all rows: averaging does not lessen it",
-        ),
-        numeric(
-            "σ [kDa]", lambda one: number(one["sigma_mass_kda"]), "median over the rows that are ok"
-        ),
-        numeric("of the mass", lambda one: percent(one["sigma_rel"])),
-        numeric(
-            "degrees of freedom", lambda one: "" if one["dof"] is None else f"{one['dof']:.0f}"
-        ),
+        worded("shared", of("common", rows), "shared by all rows: averaging does not lessen it"),
+        numeric("σ [kDa]", of("sigma_mass_kda"), "median over the rows that are ok"),
+        numeric("of the mass", of("sigma_rel", percent)),
+        numeric("degrees of freedom", of("dof", freedom)),
         worded("what shrinks it", "remedy"),
     ]
     made = tabulate(budget, columns, "Medians over the rows whose status is ok")
@@ -424,30 +402,30 @@ def _posterior_table(views: Sequence[EventView], table: pd.DataFrame) -> Table:
     """Tabulate the chains that converged, one row for each parameter."""
     rows = []
     for view in views:
-        chain_ = view.posterior
-        if chain_ is None or not chain_.converged:
+        chains = view.posterior
+        if chains is None or not chains.converged:
             continue
         fit = table[table["event"] == view.event].iloc[0]
-        for k, name in enumerate(chain_.names):
-            samples = chain_.samples[..., k]
+        bounds = chains.van_trees if chains.van_trees is not None else [None] * len(chains.names)
+        for k, name in enumerate(chains.names):
+            samples = chains.samples[..., k]
             low, median, high = np.quantile(samples, [0.15865, 0.5, 0.84135])
-            decimals = decimals_for([(high - low) / 2])
+            middle, ends = with_interval(median, low, high)
+            sigma = number(fit[f"sigma_{name}"], 2)
             rows.append(
-                (
-                    str(view.event),
-                    f"{name.split('_')[0]} [{UNITS[name]}]",
-                    fixed(median, decimals),
-                    f"{fixed(low, decimals)} to {fixed(high, decimals)}",
-                    f"{fixed(fit[name], decimals)} ± {number(fit[f'sigma_{name}'], 2)}",
-                    number(chain_.r_hat[k], 4),
-                    number(chain_.ess_bulk[k]),
-                    number(float(np.std(samples))),
-                    "–" if chain_.van_trees is None else number(chain_.van_trees[k]),
-                )
+                {
+                    "event": str(view.event),
+                    "parameter": f"{name.split('_')[0]} [{UNITS[name]}]",
+                    "median": middle,
+                    "central 68 %": ends,
+                    "fit ± σ": f"{fixed(fit[name], decimals_for([(high - low) / 2]))} ± {sigma}",
+                    "R̂": number(chains.r_hat[k], 4),
+                    "ESS": number(chains.ess_bulk[k]),
+                    "spread": number(float(np.std(samples))),
+                    "van Trees": number(bounds[k]),
+                }
             )
-    labels = ("event", "parameter", "median", "central 68 %", "fit ± σ", "R̂", "ESS", "spread")
-    columns = [numeric(label, k) for k, label in enumerate((*labels, "van Trees"))]
-    columns[1] = worded("parameter", 1)
+    columns = [numeric(label, label) for label in rows[0]] if rows else []
     return tabulate(rows, columns, "Chains that converged; posterior.nc holds them all")
 
 
@@ -462,26 +440,26 @@ def _refused_table(views: Sequence[EventView]) -> Table:
 
 def _verdicts(analysis: Analysis, table: pd.DataFrame) -> list[Table]:
     """Count the verdicts and remarks on tracks, and on events or fitted positions."""
-    if analysis.tracks is None:
-        return _verdict_table(EVENTS_KIND, table, "rows", "Verdicts")
-    return [
-        *_verdict_table(TRACKS_KIND, analysis.tracks, "tracks", "Verdicts on tracks"),
-        *_verdict_table(EVENTS_KIND, table, "positions", "Verdicts on fitted positions"),
-    ]
+    judged = [(EVENTS_KIND, table, "rows", "Verdicts")]
+    if analysis.tracks is not None:
+        judged = [
+            (TRACKS_KIND, analysis.tracks, "tracks", "Verdicts on tracks"),
+            (EVENTS_KIND, table, "positions", "Verdicts on fitted positions"),
+        ]
+    return [_verdict_table(*each) for each in judged if len(each[1])]
 
 
-def _verdict_table(kind: RowKind, rows: pd.DataFrame, counted: str, caption: str) -> list[Table]:
-    """Count verdicts and other flags, with what each means; no table of no rows."""
+def _verdict_table(kind: RowKind, rows: pd.DataFrame, counted: str, caption: str) -> Table:
+    """Count verdicts and other flags, with what each means."""
     counts = tally(rows).status | tally(rows).left_out
     found = [(s.value, str(counts[s.value]), s.advice) for s in kind.status if s.value in counts]
     flags = rows["flags"].astype(str).str.split(";").explode()
     remarks = flags[~flags.isin([*kind.status, ""])].value_counts()
-    for flag, n in remarks.items():
-        meaning = _REMARKS.get(str(flag), "A remark that makes no verdict.")
-        found.append((str(flag), str(n), meaning))
+    plain = "A remark that makes no verdict."
+    found += [(str(flag), str(n), _REMARKS.get(str(flag), plain)) for flag, n in remarks.items()]
     meaning = "what it means, and what to try"
     columns = (worded("status or flag", 0), numeric(counted, 1), worded(meaning, 2))
-    return [tabulate(found, columns, caption)] if found else []
+    return tabulate(found, columns, caption)
 
 
 # ---- The table whose rows open -------------------------------------------------------------------
@@ -517,8 +495,8 @@ def _headings(analysis: Analysis) -> Iterator[tuple[str, str]]:
 def _tracks_shown(analysis: Analysis, table: pd.DataFrame) -> Shown:
     """Give the tracks, their facts and the columns of their table."""
     tracks = tracks_of(analysis)
-    headings = {column.name: column.heading for column in TRACKS}
-    names, scale = {name: headings[name] for name in _TRACK_COLUMNS}, 1.0
+    names = {column.name: column.heading for column in TRACKS if column.heading}
+    scale = 1.0
     if main_quantity(analysis) is CONTRAST:
         tracks, scale = as_contrasts(tracks) if len(tracks) else tracks, 1e3
         for name in (name for name in names if name.endswith("mass_kda")):
