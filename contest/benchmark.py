@@ -34,7 +34,6 @@ from iscat_analysis.study import (
     score,
     share,
     share_interval,
-    spread_interval,
 )
 from iscat_contest.compare import compare_estimators
 from iscat_contest.estimators import Estimator
@@ -96,13 +95,18 @@ def run_benchmark(
         refuse_sphere(config, "the estimators of others are of dipoles")
     modes = OF_SPHERES if config.particle.is_sphere else OF_DIPOLES
     settings = {mode: make_setting(config, mode) for mode in modes}
-    tally = _Tally(
-        progress, len(modes) * (trials + fewer * (len(PHOTONS) + HEIGHTS) + posteriors * 4)
-    )
+    total = len(modes) * (trials + fewer * (len(PHOTONS) + HEIGHTS) + posteriors * 4)
+    done, lock = 0, threading.Lock()
+
+    def tally(more: int) -> None:  # of several threads
+        nonlocal done
+        with lock:
+            done += more
+            progress("benchmark", done, total)
+
     run = partial(run_trials, seed=seed, workers=threads, advance=tally)
-    sample = partial(
-        calibrate_posterior, seed=seed, workers=threads, advance=lambda n: tally(4 * n)
-    )
+    advance = lambda n: tally(4 * n)  # noqa: E731
+    sample = partial(calibrate_posterior, seed=seed, workers=threads, advance=advance)
     study: dict[str, Any] = {}
     curves: dict[str, dict[str, Any]] = {"photons": {}, "z": {}}
     histograms: dict[str, dict[str, Any]] = {"pulls": {}, "ranks": {}}
@@ -120,10 +124,8 @@ def run_benchmark(
         curves["photons"][mode] = _along_photons(config, setting, stream + 10, shorter)
         curves["z"][mode] = _along_heights(config, setting, stream + 40, shorter)
     if estimators:
-        others = compare_estimators(
-            config, estimators, trials=trials, seed=seed, time_limit_s=time_limit_s,
-            progress=progress,
-        )  # fmt: skip
+        limited = partial(compare_estimators, time_limit_s=time_limit_s, progress=progress)
+        others = limited(config, estimators, trials=trials, seed=seed)
         parts = {
             mode: {
                 "bounds": dict.fromkeys(setting.free),
@@ -186,7 +188,7 @@ def laboratory_estimates(setting: Setting, trials: Trials) -> dict[str, dict[str
 
 def _scores(setting: Setting, found: Trials, ranked: PosteriorRanks) -> dict[str, Any]:
     """Score every free parameter, and count what failed."""
-    (crbs, qcrbs), kept = (setting.crb, setting.qcrb), found.usable
+    crbs, qcrbs, kept = setting.crb, setting.qcrb, found.usable
     error = found.estimate - found.truth
     labs = laboratory_estimates(setting, found)
     out: dict[str, Any] = {}
@@ -201,25 +203,20 @@ def _scores(setting: Setting, found: Trials, ranked: PosteriorRanks) -> dict[str
             finite = miss[np.isfinite(miss)]
             if finite.size >= MIN_TRIALS:
                 scored = score(miss, np.full(miss.size, np.nan), crb, qcrb)
-                baselines[label] = {
-                    "bias": scored.bias,
-                    "bias_se": scored.bias_se,
-                    "spread": scored.spread,
-                    "spread_robust": scored.spread_robust,
-                    "spread_over_crb": scored.spread_over_crb,
+                names = ("bias", "bias_se", "spread", "spread_robust", "spread_over_crb")
+                baselines[label] = {key: getattr(scored, key) for key in names} | {
                     "robust_over_crb": scored.spread_robust / crb,
                     "rmse_over_crb": float(np.sqrt(np.mean(finite**2))) / crb,
                     "failed": int(miss.size - finite.size),
                 }
-        out[name] = {
-            **own.plain(),
-            "posterior_coverage68": share(ranked.inside68[ranked.kept, i]),
-            "posterior_coverage68_ci95": share_interval(ranked.inside68[ranked.kept, i]),
-            "posterior_coverage95": share(ranked.inside95[ranked.kept, i]),
-            "posterior_coverage95_ci95": share_interval(ranked.inside95[ranked.kept, i]),
-            "posterior_width_over_crb": _mean(ranked.width_over_crb[ranked.kept, i]),
-            "baselines": baselines,
-        }
+        widths = ranked.width_over_crb[ranked.kept, i]
+        covered = {}
+        for level, all_inside in ((68, ranked.inside68), (95, ranked.inside95)):
+            inside = all_inside[ranked.kept, i]
+            covered[f"posterior_coverage{level}"] = share(inside)
+            covered[f"posterior_coverage{level}_ci95"] = share_interval(inside)
+        covered["posterior_width_over_crb"] = float(np.mean(widths)) if widths.size else math.nan
+        out[name] = {**own.plain(), **covered, "baselines": baselines}
     return out | {
         "trials": len(found),
         "failed": int(found.failed.sum()),
@@ -264,37 +261,35 @@ def _along_heights(config: Config, setting: Setting, stream: int, run: Run) -> d
 
 def _curve(values: list[float], settings: list[Setting], stream: int, run: Run) -> dict[str, Any]:
     """Tabulate spread and bounds along an axis, for every free parameter."""
-    scored = settings[0].scored
-    out: dict[str, Any] = {"at": values, "trials": 0, "failed": [], "ambiguous": []}
+    found = [run(setting, stream=stream + number) for number, setting in enumerate(settings)]
+    out: dict[str, Any] = {
+        "at": values,
+        "trials": len(found[-1]),
+        "failed": [int(trials.failed.sum()) for trials in found],
+        "ambiguous": [int(trials.ambiguous.sum()) for trials in found],
+    }
     kinds = ("spread", "spread_ci95", "bias", "crb", "qcrb")
-    lines: dict[str, dict[str, list[Any]]] = {n: {kind: [] for kind in kinds} for n in scored}
-    for number, setting in enumerate(settings):
-        found = run(setting, stream=stream + number)
-        out["trials"] = len(found)
-        out["failed"].append(int(found.failed.sum()))
-        out["ambiguous"].append(int(found.ambiguous.sum()))
-        (crb, qcrb), kept = (setting.crb, setting.qcrb), found.usable
-        for name, k in scored.items():
-            error = found.estimate[kept, k] - found.truth[kept, k]
-            enough = error.size >= MIN_TRIALS
-            line = lines[name]
-            line["spread"].append(float(np.std(error, ddof=1)) if enough else math.nan)
-            line["spread_ci95"].append(spread_interval(error) if enough else (math.nan, math.nan))
-            line["bias"].append(float(np.mean(error)) if enough else math.nan)
-            line["crb"].append(float(crb[k]))
-            line["qcrb"].append(float(qcrb[k]))
-    return {**out, **lines}
+    for name, k in settings[0].scored.items():
+        scores = [
+            score(
+                (trials.estimate - trials.truth)[trials.usable, k],
+                trials.sigma[trials.usable, k],
+                float(setting.crb[k]),
+                float(setting.qcrb[k]),
+            )
+            for trials, setting in zip(found, settings, strict=True)
+        ]
+        out[name] = {kind: [getattr(one, kind) for one in scores] for kind in kinds}
+    return out
 
 
 def _bounds_along(config: Config, setting: Setting) -> dict[str, Any]:
     """Tabulate the bounds between the heights of the curve: fringes are narrower than its steps."""
     heights = np.linspace(*_heights_of(config), FINE_HEIGHTS)
-    settings = [
-        make_setting(config, setting.mode, z_nm=float(z), context=setting.context) for z in heights
-    ]
-    crb, qcrb = (np.array([getattr(s, kind) for s in settings]) for kind in ("crb", "qcrb"))
+    make = partial(make_setting, config, setting.mode, context=setting.context)
+    settings = [make(z_nm=float(z)) for z in heights]
     lines = {
-        name: {"crb": crb[:, k].tolist(), "qcrb": qcrb[:, k].tolist()}
+        name: {kind: [float(getattr(s, kind)[k]) for s in settings] for kind in ("crb", "qcrb")}
         for name, k in setting.scored.items()
     }
     return {"at": heights.tolist(), **lines}
@@ -316,29 +311,8 @@ def _heights(config: Config) -> list[float]:
 def _prior(setting: Setting) -> tuple[FloatArray, FloatArray]:
     """Box of the prior around a setting's particle; no width where a parameter is fixed."""
     free = np.array([name in setting.free for name in PARAMETERS])
-    low, high = setting.config.fit.z_range_nm
-    x, y, z, mass = setting.truth
-    lower = np.array(
-        [x - PRIOR_XY_NM, y - PRIOR_XY_NM, max(z - PRIOR_Z_NM, low), mass / PRIOR_MASS]
-    )
-    upper = np.array(
-        [x + PRIOR_XY_NM, y + PRIOR_XY_NM, min(z + PRIOR_Z_NM, high), mass * PRIOR_MASS]
-    )
+    reach = np.array([PRIOR_XY_NM, PRIOR_XY_NM, PRIOR_Z_NM, 0.0])
+    factor = np.array([1.0, 1.0, 1.0, PRIOR_MASS])
+    lower, upper = (setting.truth - reach) / factor, (setting.truth + reach) * factor
+    lower[2], upper[2] = np.clip([lower[2], upper[2]], *setting.config.fit.z_range_nm)
     return np.where(free, lower, setting.truth), np.where(free, upper, setting.truth)
-
-
-class _Tally:
-    """Counts trials of several threads for one progress bar."""
-
-    def __init__(self, progress: Progress, total: int) -> None:
-        self._progress, self._total, self._done = progress, total, 0
-        self._lock = threading.Lock()
-
-    def __call__(self, more: int) -> None:
-        with self._lock:
-            self._done += more
-            self._progress("benchmark", self._done, self._total)
-
-
-def _mean(values: FloatArray) -> float:
-    return float(np.mean(values)) if values.size else math.nan

@@ -12,16 +12,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from iscat_analysis.records import Analysis
-from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output
+from iscat_analysis.report.output import (
+    BENCHMARK_NAMES,
+    CHALLENGE_NAMES,
+    OUTPUT_NAMES,
+    atomic_folder,
+    check_output,
+)
 from iscat_analysis.report.tables import event_table, write_posterior, write_tables
 
 if TYPE_CHECKING:
-    from iscat_analysis.report.benchmark import (
-        BENCHMARK_NAMES,
-        CHALLENGE_NAMES,
-        render_benchmark,
-        render_challenge,
-    )
+    from iscat_analysis.report.benchmark import render_benchmark, render_challenge
     from iscat_analysis.report.movie_page import render_report
     from iscat_analysis.report.page import render_page
 
@@ -43,21 +44,14 @@ __all__ = [
     "write_report",
 ]
 
-_PAGES = {
-    "BENCHMARK_NAMES": "benchmark",
-    "CHALLENGE_NAMES": "benchmark",
-    "render_benchmark": "benchmark",
-    "render_challenge": "benchmark",
-    "render_page": "page",
-    "render_report": "movie_page",
-}
-
 
 def __getattr__(name: str) -> Any:
     """Import pages where they are asked for: Matplotlib is a quarter of all that a fit imports."""
-    if name not in _PAGES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_PAGES[name]}"), name)
+    for module in ("page", "movie_page", "benchmark") if name in __all__ else ():
+        found = vars(import_module(f"{__name__}.{module}"))
+        if name in found:
+            return found[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def write_report(

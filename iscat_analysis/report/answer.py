@@ -351,6 +351,12 @@ class Precision:
         return ("Holevo", self.holevo) if math.isfinite(self.holevo) else ("QCRB", self.qcrb)
 
     @property
+    def shared(self) -> str:
+        """The error that all events share, as text; empty where it is not known."""
+        known = math.isfinite(self.systematic)
+        return f", common to all events {number(self.systematic)}" if known else ""
+
+    @property
     def measured_text(self) -> str:
         """The measured spread over the bound with its interval."""
         low, high = self.measured_ci95

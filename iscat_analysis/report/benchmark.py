@@ -52,14 +52,6 @@ from iscat_analysis.report.style import (
     whiskers,
 )
 
-BENCHMARK_NAMES = frozenset(
-    {"benchmark.json", "benchmark.html", "benchmark.bib", "config.toml", "figures"}
-)
-"""Everything `write_benchmark` leaves in its folder."""
-
-CHALLENGE_NAMES = frozenset({"challenge.json", "challenge.html", "benchmark.bib", "figures"})
-"""Everything the score of a challenge leaves in its folder."""
-
 ENOUGH_RANKS = 100
 """Posteriors below which the uniformity of their ranks is not tested: a p-value would mislead."""
 

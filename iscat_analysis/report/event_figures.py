@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -90,18 +91,13 @@ class FilmShown:
 def event_details(analysis: Analysis, table: pd.DataFrame) -> dict[int, EventDetail]:
     """Pack what the page shows of the first events, as many as `DETAIL_BYTES` hold."""
     packed: dict[int, EventDetail] = {}
-    spent = 0
+    spent, nothing = 0, (Markup(), "")
     for row, view in views_of_rows(table, analysis.views):
-        scale = _Scale.of(view, analysis.scheme)
-        trace = clip = Markup()
-        words = sliding = ""
-        if view.trace is not None:
-            trace, words = trace_svg(view.trace), trace_words(view.trace)
-        if view.clip is not None:
-            turn = view.trace.frame if view.trace else view.clip.frames[0]
-            clip, sliding = clip_shown(view.clip, scale.low, scale.high, turn)
-        images = png_of(scale.strip(view), _PALETTE)
-        detail = EventDetail(images, scale.text, trace, words, clip, sliding)
+        scale, trace, clip = _Scale.of(view, analysis.scheme), view.trace, view.clip
+        told = nothing if trace is None else (trace_svg(trace), trace_words(trace))
+        turn = trace.frame if trace is not None else 0
+        film = nothing if clip is None else clip_shown(clip, scale.low, scale.high, turn)
+        detail = EventDetail(png_of(scale.strip(view), _PALETTE), scale.text, *told, *film)
         spent += sum(map(len, detail))
         if spent > DETAIL_BYTES:
             break
@@ -157,8 +153,8 @@ class _Scale:
     def strip(self, view: Any) -> NDArray[np.uint8]:
         """Put data, model and residual side by side, as shades of `_PALETTE`."""
         span = self.high - self.low
-        data, model = (shaded((part - self.low) / span, _SHADES)
-                       for part in (view.contrast, view.model))  # fmt: skip
+        greys = ((part - self.low) / span for part in (view.contrast, view.model))
+        data, model = (shaded(grey, _SHADES) for grey in greys)
         residual = shaded((view.residual / self.limit + 1) / 2, _SHADES, _SHADES)
         gap = np.full((*data.shape[:-1], 2), _NOTHING, np.uint8)
         return np.concatenate([data, gap, model, gap, residual], axis=-1)
@@ -235,9 +231,7 @@ def views_of_rows(table: pd.DataFrame, views: Sequence[EventView]) -> list[tuple
     numbers = table["event"].tolist()
     if [view.event for view in views] == numbers:
         return list(enumerate(views))
-    first: dict[int, int] = {}
-    for row, event in enumerate(numbers):
-        first.setdefault(event, row)
+    first = {event: row for row, event in reversed(list(enumerate(numbers)))}
     return [(first[view.event], view) for view in views if view.event in first]
 
 
@@ -246,9 +240,10 @@ def views_of_rows(table: pd.DataFrame, views: Sequence[EventView]) -> list[tuple
 
 def event_figures(analysis: Analysis, most: int) -> Iterator[Sketch]:
     """Name the images of the first events, and what draws them."""
-    times: dict[int, int] = {}
+    times: Counter[int] = Counter()
     for view in analysis.views[:most]:
-        times[view.event] = nth = times.get(view.event, 0) + 1
+        times[view.event] += 1
+        nth = times[view.event]
         name = f"event_{view.event:04d}" + (f"_{nth}" if nth > 1 else "")
         yield name, partial(triptych, view, analysis.scheme, analysis.pixel_size_nm)
 
@@ -275,17 +270,15 @@ def triptych(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:
         box = (0.075, 0.5 / height, 0.875, (below - 0.6) / height)
         draw_trace(figure.add_axes(box), view.trace)
     scale = _Scale.of(view, scheme)
-    grey = {"cmap": "gray", "vmin": scale.low, "vmax": scale.high}
-    colour = {"cmap": DIVERGING, "vmin": -scale.limit, "vmax": scale.limit}
-    panels: tuple[tuple[str, Any, dict[str, Any], str], ...] = (
-        (f"event {view.event}, data", view.contrast, grey, scale.unit),
-        ("model", view.model, grey, scale.unit),
-        ("residual", view.residual, colour, "σ"),
+    panels = (
+        (f"event {view.event}, data", view.contrast, _GREYS, (scale.low, scale.high), scale.unit),
+        ("model", view.model, _GREYS, (scale.low, scale.high), scale.unit),
+        ("residual", view.residual, DIVERGING, (-scale.limit, scale.limit), "σ"),
     )
-    for place, (title, image, colours, label) in enumerate(panels):
+    for place, (title, image, colours, (low, high), label) in enumerate(panels):
         x = 0.02 + place * 0.33
         axes = figure.add_axes((x, (below + 0.62) / height, 0.3, tall / height))
-        shown = axes.imshow(image, interpolation="nearest", **colours)
+        shown = axes.imshow(image, colours, vmin=low, vmax=high, interpolation="nearest")
         axes.set(xticks=[], yticks=[], title=title)
         axes.spines[:].set_visible(False)
         bar = figure.add_axes((x, (below + 0.48) / height, 0.3, 0.062 / height))
@@ -303,10 +296,9 @@ def corner(posterior: PosteriorResult, event: int) -> Figure:
     figure = new_figure(1.9 * n + 0.6, 1.9 * n + 0.6, constrained=False)
     grid = figure.subplots(n, n, squeeze=False, gridspec_kw={"wspace": 0.08, "hspace": 0.08})
     figure.subplots_adjust(left=0.14, right=0.98, bottom=0.12, top=0.93)
-    ends = []
-    for low, high in np.quantile(flat, [0.001, 0.999], axis=0).T:
-        pad = 0.05 * (high - low) or 0.5
-        ends.append((low - pad, high + pad))
+    ends = np.quantile(flat, [0.001, 0.999], axis=0).T
+    pads = 0.05 * np.ptp(ends, axis=1)
+    ends += np.outer(np.where(pads > 0, pads, 0.5), [-1, 1])
     quantiles = np.quantile(flat, [0.15865, 0.5, 0.84135], axis=0)
     shades = LinearSegmentedColormap.from_list("shades", ["white", BLUE])
     for i, j in np.ndindex(n, n):
@@ -342,11 +334,10 @@ def credible_shades(counts: FloatArray) -> NDArray[np.int64]:
     """Tell for each cell of a histogram which of the `CREDIBLE_LEVELS` contain it."""
     flat = counts.ravel()
     order = np.argsort(-flat, kind="stable")
-    before = np.cumsum(flat[order]) - flat[order]
-    total = max(float(flat.sum()), 1.0)
+    ranked = flat[order]
+    shares = (np.cumsum(ranked) - ranked) / max(float(flat.sum()), 1.0)
     shades = np.zeros(flat.size, dtype=np.int64)
-    for level in CREDIBLE_LEVELS:
-        shades[order] += (before < level * total) & (flat[order] > 0)
+    shades[order] = np.less.outer(shares, CREDIBLE_LEVELS).sum(axis=1) * (ranked > 0)
     return shades.reshape(counts.shape)
 
 

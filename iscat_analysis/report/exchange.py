@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -109,20 +110,12 @@ def to_photomol(fits: pd.DataFrame, *, masses: bool = True) -> pd.DataFrame:
         ``snr``, which those programs do not know and ``iscat species`` reads.
     """
     masses = truth_in("`masses`", masses)
-    rows = _events(fits)
-    table = pd.DataFrame(
-        {
-            "frame_indices": rows["frame"].astype("int64"),
-            "x_coords": rows["x_px"],
-            "y_coords": rows["y_px"],
-            "contrasts": rows["contrast"],
-        }
-    )
+    names = {"frame": "frame_indices", "x_px": "x_coords", "y_px": "y_coords"}
+    names["contrast"] = "contrasts"
     if masses:
-        table["masses_kDa"] = rows["mass_kda"]
-        table["sigma_mass_kda"] = rows["sigma_mass_kda"]
-    table["snr"] = rows["snr"]
-    return table.reset_index(drop=True)
+        names |= {"mass_kda": "masses_kDa", "sigma_mass_kda": "sigma_mass_kda"}
+    table = _renamed(_events(fits), {**names, "snr": "snr"})
+    return table.astype({"frame_indices": "int64"})
 
 
 def to_picasso(fits: pd.DataFrame, *, tracked: bool = False) -> pd.DataFrame:
@@ -148,21 +141,18 @@ def to_picasso(fits: pd.DataFrame, *, tracked: bool = False) -> pd.DataFrame:
     rows = _tracked(fits) if truth_in("`tracked`", tracked) else _events(fits)
     rows = rows[rows[["sigma_x_nm", "sigma_y_nm"]].notna().all(axis=1)]
     pixel = _pixel_nm(rows)
-    columns: dict[str, Any] = {
-        "frame": rows["frame"].to_numpy(np.uint32), "x": rows["x_px"], "y": rows["y_px"],
-        "photons": rows["n_scattered"], "lpx": rows["sigma_x_nm"] / pixel,
-        "lpy": rows["sigma_y_nm"] / pixel,
-    }  # fmt: skip
+    rows = rows.assign(lpx=rows["sigma_x_nm"] / pixel, lpy=rows["sigma_y_nm"] / pixel)
+    names = {"frame": "frame", "x_px": "x", "y_px": "y", "n_scattered": "photons"}
+    names |= {"lpx": "lpx", "lpy": "lpy"}
     if rows["sigma_z_nm"].notna().any():
-        columns |= {"z": rows["z_nm"], "lpz": rows["sigma_z_nm"]}
+        names |= {"z_nm": "z", "sigma_z_nm": "lpz"}
     if tracked:
-        columns["group"] = rows["particle"].to_numpy(np.int32)
-    columns |= {"contrast": rows["contrast"], "snr": rows["snr"]}
+        names["particle"] = "group"
+    names |= {"contrast": "contrast", "snr": "snr"}
     if rows["sigma_mass_kda"].notna().any():
-        columns |= {"mass_kda": rows["mass_kda"], "sigma_mass_kda": rows["sigma_mass_kda"]}
-    table = pd.DataFrame(columns).reset_index(drop=True)
-    floats = table.columns.difference(["frame", "group"])  # of no rows they are objects
-    return table.astype(dict.fromkeys(floats, np.float32))
+        names |= {"mass_kda": "mass_kda", "sigma_mass_kda": "sigma_mass_kda"}
+    whole = {"frame": np.uint32, "group": np.int32}
+    return _renamed(rows, names).astype({n: whole.get(n, np.float32) for n in names.values()})
 
 
 def export_result(
@@ -175,10 +165,11 @@ def export_result(
     if not is_file(folder / "fits.csv"):
         raise DataError(f"{folder}: holds no fits.csv; give an output folder of iscat fit")
     yaml_path = path.with_suffix(".yaml")
-    for taken in [path, *([yaml_path] if layout == "picasso" else [])]:
+    of_picasso = layout == "picasso"
+    for taken in (path, yaml_path) if of_picasso else (path,):
         if taken.exists() and not overwrite:
             raise DataError(f"{taken}: exists already; give another name, or pass `overwrite`")
-    if layout == "picasso" and path == yaml_path:
+    if of_picasso and path == yaml_path:
         raise DataError(f"{path}: is the name of Picasso's metadata; let `out` end in .hdf5")
     tracked = is_file(folder / "tracks.csv")
     if tracked and layout == "photomol":
@@ -190,11 +181,14 @@ def export_result(
         with open_regular(folder / "fits.csv") as table:
             fits = pd.read_csv(table, keep_default_na=False, na_values=[""])
         path.parent.mkdir(parents=True, exist_ok=True)
-        if layout == "picasso":
+        if of_picasso:
             locs, info = to_picasso(fits, tracked=tracked), _metadata(folder, fits)
             with whole_file(yaml_path) as partial_yaml, whole_file(path) as partial:
-                _write_yaml(partial_yaml, info)
-                _write_locs(partial, locs, info)
+                lines = [f"{key}: {json.dumps(value)}\n" for key, value in info.items()]
+                partial_yaml.write_text("".join(lines), encoding="utf-8")  # of which JSON is a part
+                with h5py.File(partial, "w") as file:
+                    file.create_dataset("locs", data=locs.to_records(index=False))
+                    file.create_dataset("metadata", data=json.dumps([info]))
         else:
             with whole_file(path) as partial:
                 _write(partial, fits, layout, tracked, folder)
@@ -227,18 +221,6 @@ def _write(partial: Path, fits: pd.DataFrame, layout: Layout, tracked: bool, fol
     else:
         table = to_trackpy(fits) if tracked else _trackpy(_events(fits))
     write_csv(table, partial)
-
-
-def _write_locs(path: Path, locs: pd.DataFrame, info: dict[str, Any]) -> None:
-    with h5py.File(path, "w") as file:
-        file.create_dataset("locs", data=locs.to_records(index=False))
-        file.create_dataset("metadata", data=json.dumps([info]))
-
-
-def _write_yaml(path: Path, info: dict[str, Any]) -> None:
-    """Write plain values as YAML, of which JSON's are a part."""
-    lines = [f"{key}: {json.dumps(value)}\n" for key, value in info.items()]
-    path.write_text("".join(lines), encoding="utf-8")
 
 
 def _metadata(folder: Path, fits: pd.DataFrame) -> dict[str, Any]:
@@ -277,16 +259,16 @@ def _calibrated(folder: Path) -> bool:
 def _trackpy(rows: pd.DataFrame) -> pd.DataFrame:
     """Give positions in trackpy's columns; ``particle`` where they are linked."""
     error = np.sqrt((rows["sigma_x_nm"] ** 2 + rows["sigma_y_nm"] ** 2) / 2) / _pixel_nm(rows)
-    table = pd.DataFrame(
-        {
-            "y": rows["y_px"], "x": rows["x_px"], "frame": rows["frame"].astype("int64"),
-            "mass": rows["mass_kda"], "signal": rows["contrast"].abs(), "ep": error,
-            "z": rows["z_nm"],
-        }
-    )  # fmt: skip
-    if "particle" in rows:
-        table.insert(3, "particle", rows["particle"])
-    return table.reset_index(drop=True)
+    linked = {"particle": "particle"} if "particle" in rows else {}
+    names = {"y_px": "y", "x_px": "x", "frame": "frame", **linked, "mass_kda": "mass"}
+    names |= {"signal": "signal", "ep": "ep", "z_nm": "z"}
+    table = _renamed(rows.assign(signal=rows["contrast"].abs(), ep=error), names)
+    return table.astype({"frame": "int64"})
+
+
+def _renamed(rows: pd.DataFrame, names: Mapping[str, str]) -> pd.DataFrame:
+    """Give these columns, under other names and numbered from 0."""
+    return rows[list(names)].rename(columns=dict(names)).reset_index(drop=True)
 
 
 def _pixel_nm(rows: pd.DataFrame) -> float:

@@ -186,7 +186,9 @@ def page_context(
     free = free_parameters(analysis.mode, table)
     precision = [precision_of(analysis, table, name) for name in free]
     kept = f"images of the first {len(images)} of {len(rows)} rows"
-    left_out = f"To keep this page small it holds the {kept}." if len(images) < len(rows) else ""
+    left_out = (
+        f"To keep this page small it holds the {kept}." if 0 < len(images) < len(rows) else ""
+    )
     ranks = list(Severity)
     findings = sorted(analysis.findings, key=lambda f: -ranks.index(f.severity))
     species = _species(analysis, table)
@@ -281,9 +283,7 @@ def _facts(analysis: Analysis, table: pd.DataFrame) -> list[Fact]:
         return facts
     label, unit = LABELS[name], UNITS[name]
     best, bound = p.best
-    known = math.isfinite(p.systematic)
-    shared = f", common to all events {number(p.systematic)}" if known else ""
-    sigma = f"σ {number(p.sigma)}{shared}, CRB {number(p.crb)} {unit}"
+    sigma = f"σ {number(p.sigma)}{p.shared}, CRB {number(p.crb)} {unit}"
     beside = f", {best} {number(bound)} {unit}"
     if is_uncalibrated(analysis):
         label, sigma, beside = "contrast", "median of the events' own ratios", ""

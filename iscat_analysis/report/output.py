@@ -26,26 +26,21 @@ FILE_LIST = ".iscat-files"
 """The list of files in every output folder: a first line, then a path in each, as JSON."""
 
 OUTPUT_NAMES = frozenset(
-    {
-        "fits.csv",
-        "fits.parquet",
-        "tracks.csv",
-        "tracks.parquet",
-        "summary.json",
-        "config.toml",
-        "posterior.nc",
-        "response.csv",
-        "report.html",
-        "figures",
-        FILE_LIST,
-    }
+    {"fits.csv", "fits.parquet", "tracks.csv", "tracks.parquet", "summary.json", "config.toml"}
+    | {"posterior.nc", "response.csv", "report.html", "figures", FILE_LIST}
 )
 """Everything `write_report` may leave in its folder."""
 
-PAGES = (
-    "report.html", "batch.html", "camera.html", "calibration.html", "optics.html", "template.html",
-    "benchmark.html", "challenge.html", "comparison.html",
-)  # fmt: skip
+BENCHMARK_NAMES = frozenset(
+    {"benchmark.json", "benchmark.html", "benchmark.bib", "config.toml", "figures"}
+)
+"""Everything `write_benchmark` leaves in its folder."""
+
+CHALLENGE_NAMES = frozenset({"challenge.json", "challenge.html", "benchmark.bib", "figures"})
+"""Everything the score of a challenge leaves in its folder."""
+
+_SUBJECTS = ("report", "batch", "camera", "calibration", "optics", "template", "benchmark")
+PAGES = tuple(f"{name}.html" for name in (*_SUBJECTS, "challenge", "comparison"))
 """Pages that the commands write."""
 
 _HEADING = "Files of iscat-analysis; what is not in this list is never removed."

@@ -49,14 +49,8 @@ def render_document(
 ) -> str:
     """Fill a page of sections; `frame` replaces what the frame of a page says by itself."""
     nav = [(part.id, part.short or part.title) for part in sections]
-    about = {
-        "title": title,
-        "subtitle": subtitle,
-        "sections": sections,
-        "nav": nav,
-        **(frame or {}),
-    }
-    return render_page("document.html", about)
+    about = {"title": title, "subtitle": subtitle, "sections": sections, "nav": nav}
+    return render_page("document.html", {**about, **(frame or {})})
 
 
 def configuration(toml: str, lead: str) -> Section:
@@ -104,10 +98,8 @@ def _cell(value: Any) -> str:
     """Format a table cell: numbers to four digits unless two say it all, nothing as a dash."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "—"
-    if isinstance(value, float):
-        plain = value.is_integer() or float(f"{value:.2g}") == value
-        short = f"{value:.4g}" if plain else f"{value:#.4g}".rstrip(".")
-        return short.replace("-", "−")
-    if isinstance(value, Markup):
+    if isinstance(value, str):
         return value
-    return str(value).replace("-", "−") if isinstance(value, int) else str(value)
+    if isinstance(value, float) and not value.is_integer() and float(f"{value:.2g}") != value:
+        return f"{value:#.4g}".rstrip(".").replace("-", "−")
+    return (f"{value:.4g}" if isinstance(value, float) else str(value)).replace("-", "−")

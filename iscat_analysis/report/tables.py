@@ -31,10 +31,11 @@ def event_table(analysis: Analysis) -> pd.DataFrame:
         raise ValueError(f"analysis.table lacks the columns {', '.join(missing)}")
     further = [name for name in analysis.table.columns if name not in EVENT_COLUMNS]
     table = analysis.table.reindex(columns=[*EVENT_COLUMNS, *further]).reset_index(drop=True)
-    kept = [column for column in EVENTS if not column.optional]
-    for name in (column.name for column in kept if column.is_text):
-        table[name] = [_text(value) for value in table[name]]
-    return table.astype({column.name: column.dtype for column in kept})
+    kept = {column.name: column for column in EVENTS if not column.optional}
+    for name in kept:
+        if kept[name].is_text:
+            table[name] = table[name].map(_text)
+    return table.astype({name: column.dtype for name, column in kept.items()})
 
 
 def _text(value: Any) -> str:
@@ -85,35 +86,31 @@ def posterior_groups(analysis: Analysis, views: Sequence[EventView]) -> dict[str
     axes = ("chain", "draw", "event")
     samples = np.stack([p.samples[:n_chain, -n_draw:] for p in chains], axis=2)
     values = np.stack([p.log_likelihood[:n_chain, -n_draw:] for p in chains], axis=2)
-    coordinates = {
-        "chain": range(n_chain),
-        "draw": range(n_draw),
-        "event": [view.event for view in views],
-    }
-    refused = [
-        (int(view.event), view.posterior.message)
+    events = [view.event for view in views]
+    coordinates = {"chain": range(n_chain), "draw": range(n_draw), "event": events}
+    refused = {
+        int(view.event): view.posterior.message
         for view in analysis.views
         if view.posterior is not None and not view.posterior.converged
-    ]
+    }
     about = {
         "sampling_library": "emcee",
         "input_path": analysis.provenance.input_path,
         "input_sha256": analysis.provenance.input_sha256,
-        "events_not_converged": json.dumps([event for event, _ in refused]),
-        "reasons_not_converged": json.dumps([message for _, message in refused]),
+        "events_not_converged": json.dumps(list(refused)),
+        "reasons_not_converged": json.dumps(list(refused.values())),
         "draws_before_cutting": json.dumps([int(p.samples.shape[1]) for p in chains]),
     }
-    by_parameter = {
-        name: (("event", "parameter"), np.stack([getattr(p, name) for p in chains]))
-        for name in ("tau", "r_hat", "ess_bulk", "ess_tail")
-    }
+    kinds = ["tau", "r_hat", "ess_bulk", "ess_tail"]
     if all(p.van_trees is not None for p in chains):
-        bounds = np.stack([np.asarray(p.van_trees) for p in chains])
-        by_parameter["van_trees"] = (("event", "parameter"), bounds)
+        kinds.append("van_trees")
     statistics = {
         "log_likelihood": (axes, values),
         "acceptance": (("event",), np.array([p.acceptance for p in chains])),
-        **by_parameter,
+        **{
+            kind: (("event", "parameter"), np.stack([getattr(p, kind) for p in chains]))
+            for kind in kinds
+        },
     }
     variables = {
         name: (axes, samples[..., k], {"units": UNITS[name]}) for k, name in enumerate(names)

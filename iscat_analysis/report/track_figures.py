@@ -24,12 +24,13 @@ from iscat_analysis.report.style import (
     BLUE,
     GREY,
     INK,
-    PURPLE,
     Sketch,
     Style,
     field_figure,
+    judged,
     legend,
     new_figure,
+    one_panel,
     plain_log,
     points,
 )
@@ -111,13 +112,9 @@ def trajectories(analysis: Analysis, fits: pd.DataFrame) -> Figure:
     """Draw the field with the paths of its particles, coloured by mass."""
     tracks = tracks_of(analysis)
     image = np.asarray(analysis.ratio_image, float)
-    figure, axes, _ = field_figure(
-        image,
-        analysis.scheme,
-        analysis.pixel_size_nm,
-        bright=2.0,
-        style={"interpolation": "antialiased"},
-    )
+    smooth: Style = {"interpolation": "antialiased"}
+    pixel_nm = analysis.pixel_size_nm
+    figure, axes, _ = field_figure(image, analysis.scheme, pixel_nm, bright=2.0, style=smooth)
     paths = dict(iter(fits.sort_values("frame").groupby(track_numbers(fits))))
     lines = [paths[track][["x_px", "y_px"]].to_numpy(float) for track in tracks["track"]]
     drawn = LineCollection(lines, colors=_shades(analysis), linewidths=1.1, capstyle="round")
@@ -137,8 +134,7 @@ def mass_d(analysis: Analysis) -> Figure:
     d, d_sigma = (tracks[name].to_numpy(float) for name in ("d_um2_s", "sigma_d_um2_s"))
     usable = np.isfinite(mass) & (d > 0)
     good = usable & _ok(tracks)
-    figure = new_figure(5.2, 4.0)
-    axes = figure.add_subplot()
+    figure, axes = one_panel(5.2, 4.0)
     x_ends, y_ends = _span(mass[usable], sigma[usable]), _log_span(d[usable], d_sigma[usable])
     shown = good if good.any() else usable
     cells = 120  # along each axis; the outermost have their middles at the ends of the axes
@@ -150,12 +146,11 @@ def mass_d(analysis: Analysis) -> Figure:
     place: Style = {"extent": (-half, 1 + half, -half, 1 + half), "transform": axes.transAxes}
     how: Style = {"origin": "lower", "aspect": "auto", "interpolation": "bilinear"}
     axes.imshow(density, cmap=shade, vmin=0, **how, **place)
-    for rows, color, mark in ((good, INK, "ok"), (usable & ~good, PURPLE, "flagged")):
-        if 0 < rows.sum() <= MOST_TRACKS:
+    for rows, color, name in judged(usable, good, INK):
+        if rows.sum() <= MOST_TRACKS:
             style: Style = {"ls": "none", "elinewidth": 0.6, "alpha": 0.6, "color": color}
             axes.errorbar(mass[rows], d[rows], _bars(tracks, rows), sigma[rows], **style)
-        if rows.any():
-            points(axes, mass, d, rows, style={"color": color, "ms": 3, "mew": 0, "label": mark})
+        points(axes, mass, d, rows, style={"color": color, "ms": 3, "mew": 0, "label": name})
     if (usable & ~good).any():
         legend(figure)
     axes.set(xlim=x_ends, ylim=y_ends, xlabel=track_quantity(analysis).axis, ylabel="D [µm²/s]")
@@ -189,16 +184,15 @@ def distributions(analysis: Analysis) -> Figure:
         above.fill_between(grid, curve, color=BLUE, alpha=0.3, lw=0)
         above.plot(grid, curve, color=BLUE, lw=1)
         rank = np.argsort(np.argsort(value)).astype(float)
-        for rows, color in ((usable & good, BLUE), (usable & ~good, PURPLE)):
-            if rows.any() and usable.sum() <= MOST_TRACKS:
+        for rows, color, _ in judged(usable, good):
+            if usable.sum() <= MOST_TRACKS:
                 style: Style = {"ls": "none", "elinewidth": 0.7, "color": color}
                 bars = _bars(tracks, rows) if log else error[rows]
                 below.errorbar(value[rows], rank[rows], xerr=bars, **style)
-            if rows.any():
-                points(below, value, rank, rows, style={"color": color, "ms": 2.5, "mew": 0})
+            points(below, value, rank, rows, style={"color": color, "ms": 2.5, "mew": 0})
         above.set(ylim=(0, None))
-        above.spines.left.set_visible(False)
-        below.spines.left.set_visible(False)
+        for axes in (above, below):
+            axes.spines.left.set_visible(False)
         below.set_xlim(ends)
         if log:
             plain_log(below, "x")
@@ -215,12 +209,9 @@ def msd(analysis: Analysis, fits: pd.DataFrame) -> Figure | None:
     if rate is None or usable.empty:
         return None
     exposure_s = 1 / rate if exposure is None else exposure / 1e3
-    ranked = usable.assign(bad=~_ok(usable)).sort_values(
-        ["bad", "n_d_frames"], ascending=[True, False]
-    )
+    ranked = usable.iloc[np.lexsort([-usable["n_d_frames"], ~_ok(usable)])]
     numbers, shades = track_numbers(fits), _shades(analysis)
-    figure = new_figure(6.2, 3.6)
-    axes = figure.add_subplot()
+    figure, axes = one_panel(6.2, 3.6)
     for row in ranked.head(6).index:
         track = tracks.loc[row]
         path = fits[numbers == track["track"]].drop_duplicates("frame").sort_values("frame")
@@ -248,11 +239,10 @@ def mean_squared_displacement(path: pd.DataFrame) -> tuple[FloatArray, FloatArra
     found = []
     for lag in lags:
         _, first, second = np.intersect1d(frames + lag, frames, return_indices=True)
-        steps = places[second] - places[first]
-        if len(steps):
-            square = np.mean(np.sum(steps**2, axis=1))
-            found.append((float(lag), float(square), float(np.mean(noise[first] + noise[second]))))
-    at, square, error = np.array(found).reshape(-1, 3).T
+        if first.size:
+            squares = ((places[second] - places[first]) ** 2).sum(axis=1)
+            found.append((lag, squares.mean(), np.mean(noise[first] + noise[second])))
+    at, square, error = np.array(found, dtype=float).reshape(-1, 3).T
     return at, square, error
 
 
@@ -268,14 +258,14 @@ def _bars(tracks: pd.DataFrame, rows: BoolArray) -> FloatArray:
 
 
 def _span(values: FloatArray, errors: FloatArray) -> tuple[float, float]:
-    wide = np.where(np.isfinite(errors), errors, 0.0)
+    wide = np.nan_to_num(errors)
     low, high = float((values - 2 * wide).min()), float((values + 2 * wide).max())
     pad = 0.08 * (high - low) or 0.1 * abs(high) or 1.0
     return max(low - pad, 0.0), high + pad
 
 
 def _log_span(values: FloatArray, errors: FloatArray) -> tuple[float, float]:
-    wide = np.exp(np.minimum(np.where(np.isfinite(errors), errors, 0.0) / values, 1.0))
+    wide = np.exp(np.minimum(np.nan_to_num(errors) / values, 1.0))
     return float((values / wide).min()) / 1.4, float((values * wide).max()) * 1.4
 
 
@@ -316,8 +306,7 @@ def size_plane(analysis: Analysis) -> Figure:
 
     length = lengths(optical, sphere)
     slope = (lengths(optical * (1 + step), sphere) - length) / (step * optical)
-    figure = new_figure(5.2, 4.2)
-    axes = figure.subplots()
+    figure, axes = one_panel(5.2, 4.2)
     ends = 0.7 * min(moved.min(), optical.min()), 1.3 * max(moved.max(), optical.max())
     diameters = np.linspace(*ends, 200)
     own = "shell" if sphere.shell_nm else f"{sphere.index.real:.2f}"
@@ -330,10 +319,9 @@ def size_plane(analysis: Analysis) -> Figure:
         beside: Style = {"xytext": (3, 0), "textcoords": "offset points", "va": "center"}
         axes.annotate(label, (diameters[-1], line[-1]), color=color, fontsize="small", **beside)
     good, up = _ok(tracks), np.abs(slope * sigma)
-    for rows, color, name in ((good, INK, "ok"), (~good, PURPLE, "flagged")):
-        if rows.any():
-            dots: Style = {"fmt": "o", "ms": 3, "elinewidth": 0.7, "color": color, "label": name}
-            axes.errorbar(moved[rows], length[rows], up[rows], error[rows], **dots)
+    for rows, color, name in judged(np.ones(good.size, dtype=bool), good, INK):
+        dots: Style = {"fmt": "o", "ms": 3, "elinewidth": 0.7, "color": color, "label": name}
+        axes.errorbar(moved[rows], length[rows], up[rows], error[rows], **dots)
     if not good.all():
         axes.legend(loc="upper left")
     axes.set(xlabel="hydrodynamic diameter [nm]", ylabel="scattering length [nm]")

@@ -15,7 +15,8 @@ from sketches import sketch_figures
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.posterior import van_trees
 from iscat_analysis.records import FREE_PARAMETERS
-from iscat_analysis.report.benchmark import BENCHMARK_NAMES, benchmark_figures, render_benchmark
+from iscat_analysis.report import BENCHMARK_NAMES, render_benchmark
+from iscat_analysis.report.benchmark import benchmark_figures
 from iscat_analysis.study import (
     make_setting,
     pull_histogram,
