@@ -96,14 +96,7 @@ def run_benchmark(
     modes = OF_SPHERES if config.particle.is_sphere else OF_DIPOLES
     settings = {mode: make_setting(config, mode) for mode in modes}
     total = len(modes) * (trials + fewer * (len(PHOTONS) + HEIGHTS) + posteriors * 4)
-    done, lock = 0, threading.Lock()
-
-    def tally(more: int) -> None:  # of several threads
-        nonlocal done
-        with lock:
-            done += more
-            progress("benchmark", done, total)
-
+    tally = _tally(progress, total)
     run = partial(run_trials, seed=seed, workers=threads, advance=tally)
     advance = lambda n: tally(4 * n)  # noqa: E731
     sample = partial(calibrate_posterior, seed=seed, workers=threads, advance=advance)
@@ -175,6 +168,19 @@ def _pull(trials: Trials, k: int) -> FloatArray:
     kept = trials.usable
     pull: FloatArray = (trials.estimate[kept, k] - trials.truth[kept, k]) / trials.sigma[kept, k]
     return pull
+
+
+def _tally(progress: Progress, total: int) -> Callable[[int], None]:
+    """Count trials of several threads for one progress bar."""
+    done, lock = 0, threading.Lock()
+
+    def tally(more: int) -> None:
+        nonlocal done
+        with lock:
+            done += more
+            progress("benchmark", done, total)
+
+    return tally
 
 
 def laboratory_estimates(setting: Setting, trials: Trials) -> dict[str, dict[str, FloatArray]]:

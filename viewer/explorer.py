@@ -86,10 +86,11 @@ class Explorer(QWidget):
         super().__init__()
         self._viewer = napari_viewer
         self._preview: ia.Preview | None = None
-        self._made_of: tuple[Any, ...] = ()  # what the preview was made of
+        self._movie: Any = None  # of the preview, and what else it was made of
+        self._made_of: tuple[int, str, int] = (0, "", 0)
         self._look: ia.Look | None = None
         self._window = 0  # of the last look
-        self._ratio: _Ratio | None = None
+        self._ratio: Any = None  # the layer of the contrast
 
         self.movie = QComboBox()
         self.config = QLineEdit()
@@ -146,12 +147,9 @@ class Explorer(QWidget):
     def _listen(self) -> None:
         """Hear what happens in the viewer, as long as the widget is there."""
         changes, clicks = self._viewer.layers.events, self._viewer.mouse_drag_callbacks
-        heard = [
-            (changes.inserted, self._list_layers),
-            (changes.removed, self._list_layers),
-            (changes.renamed, self._list_layers),
-            (self._viewer.dims.events.current_step, self._frame_changed),
-        ]
+        of_layers = (changes.inserted, changes.removed, changes.renamed)
+        heard = [(event, self._list_layers) for event in of_layers]
+        heard.append((self._viewer.dims.events.current_step, self._frame_changed))
         for event, callback in heard:
             event.connect(callback)
         clicked = self.on_click
@@ -171,13 +169,12 @@ class Explorer(QWidget):
         movies = [layer for layer in self._viewer.layers if _is_movie(layer)]
         chosen = self.movie.currentData()
         if movies != [self.movie.itemData(k) for k in range(self.movie.count())]:
-            self.movie.blockSignals(True)
-            self.movie.clear()
-            for layer in movies:
-                self.movie.addItem(layer.name, layer)
-            index = movies.index(chosen) if chosen in movies else 0
-            self.movie.setCurrentIndex(index if movies else -1)
-            self.movie.blockSignals(False)
+            with _silent(self.movie):
+                self.movie.clear()
+                for layer in movies:
+                    self.movie.addItem(layer.name, layer)
+                index = movies.index(chosen) if chosen in movies else 0
+                self.movie.setCurrentIndex(index if movies else -1)
             if self.movie.currentData() is not chosen:
                 self._search_soon()
         for k, layer in enumerate(movies):
@@ -210,19 +207,15 @@ class Explorer(QWidget):
             self._say("open a movie first")
             return None
         stamp = Path(path).stat().st_mtime_ns if path and Path(path).is_file() else 0
-        wanted = layer, layer.data, path, stamp
-        if self._preview is not None and _same(wanted, self._made_of):
+        movie, wanted = layer.data, (id(layer), path, stamp)
+        if self._preview is not None and self._made_of == wanted and self._movie is movie:
             return self._preview
         with self._errors_shown(), _busy():
-            movie = layer.data
-            stack = (
-                movie.stack
-                if isinstance(movie, LazyMovie)
-                else ia.open_stack(movie, name=layer.name)
-            )
+            is_open = isinstance(movie, LazyMovie)
+            stack = movie.stack if is_open else ia.open_stack(movie, name=layer.name)
             config = ia.configure(Path(path) if path else None)
             preview = ia.Preview(stack, config)
-            self._preview, self._made_of = preview, wanted
+            self._preview, self._made_of, self._movie = preview, wanted, movie
             with _silent(self.window_frames):
                 self.window_frames.setRange(1, max(preview.longest, 1))
                 self.window_frames.setValue(preview.window)
@@ -242,9 +235,9 @@ class Explorer(QWidget):
                 with _silent(self.threshold):
                     self.threshold.setValue(preview.threshold(window))
                 self._window = window
-                if self._ratio is not None and self._ratio.frames.preview is preview:
-                    self._ratio.frames.window = window
-                    self._ratio.layer.refresh()
+                if self._ratio is not None and self._ratio.data.preview is preview:
+                    self._ratio.data.window = window
+                    self._ratio.refresh()
             self._look = preview.look(self.frame, window)
             self._show_found()
 
@@ -276,27 +269,17 @@ class Explorer(QWidget):
         layer = next((one for one in self._viewer.layers if one.name == FOUND), None)
         if layer is None:
             active = self._viewer.layers.selection.active
-            layer = self._viewer.add_points(
-                np.zeros((0, 3)),
-                ndim=3,
-                name=FOUND,
-                size=_SPOT_PX,
-                face_color="transparent",
-                symbol="square",
-                border_width=_THIN,
-            )
+            marks = {"size": _SPOT_PX, "symbol": "square", "border_width": _THIN}
+            marks |= {"face_color": "transparent", "name": FOUND}
+            layer = self._viewer.add_points(np.zeros((0, 3)), ndim=3, **marks)
             self._viewer.layers.selection.active = active or layer
         layer.scale, layer.translate = movie.scale[-3:], movie.translate[-3:]
         layer.data = points
         layer.features = found
         layer.border_color = colours or _LANDS
         layer.selected_data = set()
-        layer.text = {
-            "string": "{snr:.1f}",
-            "size": 8,
-            "color": "white",
-            "translation": [0.0, -0.75 * _SPOT_PX, 0.0],
-        }
+        above = [0.0, -0.75 * _SPOT_PX, 0.0]
+        layer.text = {"string": "{snr:.1f}", "size": 8, "color": "white", "translation": above}
         first, last = look.after
         after = f"frame {first}" if last == first + 1 else f"frames {first}:{last}"
         over = "" if look.before is None else f" over {look.before[0]}:{look.before[1]}"
@@ -327,15 +310,9 @@ class Explorer(QWidget):
             frames = RatioFrames(preview, movie.data.shape, self.window_frames.value())
             low, high = film_limits(frames.__getitem__, (0, len(frames)))
             limit = max(abs(low), abs(high))
-            layer = self._viewer.add_image(
-                frames,
-                name=RATIO,
-                colormap="gray",
-                contrast_limits=(-limit, limit),
-                scale=movie.scale[-3:],
-                translate=movie.translate[-3:],
-            )
-            self._ratio = _Ratio(layer, frames)
+            place = {"scale": movie.scale[-3:], "translate": movie.translate[-3:]}
+            greys = {"colormap": "gray", "contrast_limits": (-limit, limit)}
+            self._ratio = self._viewer.add_image(frames, name=RATIO, **greys, **place)
 
     # ---- events ----------------------------------------------------------------------------
 
@@ -345,12 +322,8 @@ class Explorer(QWidget):
             result = _result_of(layer)
             if result is None or not layer.visible or not hasattr(layer, "symbol"):
                 continue
-            index = layer.get_value(
-                event.position,
-                view_direction=event.view_direction,
-                dims_displayed=event.dims_displayed,
-                world=True,
-            )
+            seen = {"view_direction": event.view_direction, "dims_displayed": event.dims_displayed}
+            index = layer.get_value(event.position, world=True, **seen)
             if index is not None:
                 self.show_event(result, int(layer.features[ROW].iloc[index]))
                 return
@@ -384,13 +357,6 @@ class RatioFrames(LazyFrames):
         self.preview, self.window = preview, window
 
 
-class _Ratio:
-    """The layer of the contrast and its frames."""
-
-    def __init__(self, layer: Any, frames: RatioFrames) -> None:
-        self.layer, self.frames = layer, frames
-
-
 def _is_movie(layer: Any) -> bool:
     """Whether a layer may be a camera's movie."""
     data = layer.data
@@ -406,13 +372,6 @@ def _is_movie(layer: Any) -> bool:
 def _result_of(layer: Any) -> ia.StoredResult | None:
     found = layer.metadata.get(RESULT)
     return found if isinstance(found, ia.StoredResult) else None
-
-
-def _same(one: tuple[Any, ...], two: tuple[Any, ...]) -> bool:
-    """Whether the same things were given; arrays are compared by what they are, not by value."""
-    return len(one) == len(two) and all(
-        a is b or (isinstance(a, (str, int)) and a == b) for a, b in zip(one, two, strict=True)
-    )
 
 
 @contextmanager

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis import (
@@ -79,10 +78,6 @@ RESULT, ROW = "iscat_result", "row"
 """Key of a layer's metadata that holds the `StoredResult`, and the feature with its table's row."""
 
 
-_COLOURS = {Status.OK.value: "lime"}
-_DOUBTFUL = "orange"
-
-
 def movie_reader(path: str | Sequence[str]) -> Callable[[Any], list[LayerData]] | None:
     """Tell whether this is a movie that `open_stack` may read."""
     if not isinstance(path, str) or _is_result(Path(path)):
@@ -127,12 +122,12 @@ def result_layers(result: StoredResult) -> list[LayerData]:
         points[:, 0] /= SHOWN_FRAMES
     elif result.tracks is None:  # they are there in all frames after the background
         points, scale = points[:, 1:], scale[1:]
+    colours = ["lime" if status == Status.OK else "orange" for status in placed["status"]]
     options = {
         "name": f"{name} events",
         "features": placed.assign(**{ROW: placed.index}).reset_index(drop=True),
         "face_color": "transparent",
-        "border_color": [_COLOURS.get(str(status), _DOUBTFUL) for status in placed["status"]]
-        or "lime",
+        "border_color": colours or "lime",
         "size": 12.0,
         "border_width": 0.06,
         "scale": scale,
@@ -151,13 +146,12 @@ def _tracks_layer(result: StoredResult) -> list[LayerData]:
     features = rows.drop(columns="track", errors="ignore").join(whole, on="particle")
     options = {
         "name": f"{result.folder.name} tracks",
-        "features": _plain(features.assign(**{ROW: rows.index})),
+        # numbers are all that colours of tracks can be made of
+        "features": features.assign(**{ROW: rows.index})
+        .select_dtypes("number")
+        .astype(float)
+        .reset_index(drop=True),
         "metadata": {RESULT: result},
     }
     data = rows[["particle", "frame", "y_px", "x_px"]].to_numpy(float)
     return [(data, options, "tracks")]
-
-
-def _plain(table: pd.DataFrame) -> pd.DataFrame:
-    """Keep the numbers, which are all that colours of tracks can be made of."""
-    return table.select_dtypes("number").astype(float).reset_index(drop=True)

@@ -370,7 +370,8 @@ def draw(analysis: Analysis, kind: str) -> Figure:
         raise DataError(f"{_movie(analysis)}: no event was found, so there is no {kind} to draw")
     makers = {"overview": overview, "histogram": histogram, "precision": precision}
     if analysis.tracks is not None:
-        makers |= {"overview": track_figures.trajectories, "histogram": track_figures.distributions}
+        makers["overview"] = track_figures.trajectories
+        makers["histogram"] = lambda analysis, _: track_figures.distributions(analysis)
     return _shown(partial(makers[kind], analysis, table))
 
 
