@@ -18,7 +18,6 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
-from matplotlib.ticker import MaxNLocator
 
 from iscat_analysis.config import SCHEMES
 from iscat_analysis.records import PARAMETERS
@@ -46,10 +45,12 @@ from iscat_analysis.report.style import (
     floats,
     legend,
     new_figure,
+    one_panel,
     plain_log,
     publish,
     row_of_panels,
     whiskers,
+    whole_numbers,
 )
 
 ENOUGH_RANKS = 100
@@ -128,6 +129,12 @@ def _interval(key: str) -> Callable[[Any], str]:
     return lambda row: bracketed(row.get(key), row.get(f"{key}_ci95", ()))
 
 
+def _bias(row: Any) -> str:
+    """Write a bias with its standard error."""
+    known = number(row.get("bias"))
+    return known if known == "—" else f"{known} ± {number(row['bias_se'], 2)}"
+
+
 def _legend_below(figure: Figure) -> None:
     legend(figure, where="lower center", columns=2 + 2 * len(figure.axes))
 
@@ -165,11 +172,11 @@ def _summary(study: Mapping[str, Any]) -> Section:
     modes = [mode for mode in MODES if mode in study]
     facts = []
     for mode in modes:
-        names = _named(study[mode])
-        ratios = floats(study[mode][name]["spread_over_crb"] for name in names)
+        entry, names = study[mode], _named(study[mode])
+        ratios = floats(entry[name]["spread_over_crb"] for name in names)
         finite = ratios[np.isfinite(ratios)]
         named = ", ".join(LABELS[n] for n in names)
-        note = f"over {named}; {study[mode]['failed']} of {study[mode]['trials']} fits failed"
+        note = f"over {named}; {entry['failed']} of {entry['trials']} fits failed"
         value = f"{finite.min():.2f}–{finite.max():.2f}" if finite.size else "—"
         facts.append(Fact(f"spread / CRB, {mode}", value, note=note))
     rows = [
@@ -193,8 +200,8 @@ def _summary(study: Mapping[str, Any]) -> Section:
         "The last columns show what other estimators make of the same counts: root-mean-square "
         "error over the CRB."
     )
-    tables = [tabulate(rows, columns, "Every free parameter in every mode")]
-    return Section("summary", "Summary", lead, facts, tables=tables)
+    table = tabulate(rows, columns, "Every free parameter in every mode")
+    return Section("summary", "Summary", lead, facts, tables=[table])
 
 
 def _mode_section(study: Mapping[str, Any], mode: str, drawn: Mapping[str, Markup]) -> Section:
@@ -217,10 +224,6 @@ def _mode_section(study: Mapping[str, Any], mode: str, drawn: Mapping[str, Marku
         f"flagged: {', '.join(flagged) or 'none'}."
     )
 
-    def bias(row: Any) -> str:
-        known = number(row["bias"], 2)
-        return known if known == "—" else f"{known} ± {number(row['bias_se'], 2)}"
-
     def share(key: str) -> Callable[[Any], str]:
         def cell(row: Any) -> str:
             low, high = (percent(end, 1).removesuffix(" %") for end in row[f"{key}_ci95"])
@@ -232,7 +235,7 @@ def _mode_section(study: Mapping[str, Any], mode: str, drawn: Mapping[str, Marku
     achieved = [
         worded("parameter", of("name", parameter)),
         numeric("truth", lambda row: at[row["name"]]),
-        numeric("bias", bias),
+        numeric("bias", _bias),
         numeric("spread", _interval("spread")),
         numeric("CRB", of("crb")),
         numeric("QCRB", of("qcrb")),
@@ -262,14 +265,11 @@ def _mode_section(study: Mapping[str, Any], mode: str, drawn: Mapping[str, Marku
 
 def benchmark_figures(study: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     """Draw the figures."""
-    for mode in MODES:
-        if mode not in study:
-            continue
+    for mode in (mode for mode in MODES if mode in study):
         names = _named(study[mode])
-        for axis, stem in (("photons", "photons"), ("z", "heights")):
-            curve = study["curves"][axis][mode]
-            along = "photons" if axis == "photons" else "height"
-            yield f"{stem}_{mode}", _panels(names, partial(_draw_curve, along, curve))
+        for key, axis, stem in (("photons", "photons", "photons"), ("z", "height", "heights")):
+            curve = study["curves"][key][mode]
+            yield f"{stem}_{mode}", _panels(names, partial(_draw_curve, axis, curve))
         for kind, draw in (("pulls", _draw_pulls), ("ranks", _draw_ranks)):
             if bins := study["histograms"][kind][mode]:
                 yield f"{kind}_{mode}", _panels(names, partial(draw, bins))
@@ -307,8 +307,8 @@ def _draw_pulls(found: Mapping[str, Any], axes: Axes, name: str) -> None:
     counts, edges = floats(bins["counts"]), floats(bins["edges"])
     axes.stairs(counts, edges, fill=True, color=VERMILLION, label="fits")
     axes.plot((edges[1:] + edges[:-1]) / 2, floats(bins["expected"]), color=INK, label="normal")
-    axes.set(ylim=(0, 1.25 * max(counts.max(), 1.0)), xlabel="(estimate − truth) / σ")
-    axes.set_ylabel("fits")
+    axes.set_ylim(0, 1.25 * max(counts.max(), 1.0))
+    whole_numbers(axes, "(estimate − truth) / σ", "fits")
 
 
 def _draw_ranks(found: Mapping[str, Any], axes: Axes, name: str) -> None:
@@ -319,9 +319,8 @@ def _draw_ranks(found: Mapping[str, Any], axes: Axes, name: str) -> None:
     axes.axhline(float(counts.mean()), color=INK, linewidth=1, label="uniform")
     if counts.sum() >= ENOUGH_RANKS:
         axes.set_title(f"p = {bins['p_value']:.2g}", loc="right", fontsize=8)
-    axes.set(ylim=(0, 1.25 * max(counts.max(), 1.0)), xlabel="rank of the truth")
-    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-    axes.set_ylabel("posteriors")
+    axes.set_ylim(0, 1.25 * max(counts.max(), 1.0))
+    whole_numbers(axes, "rank of the truth", "posteriors")
 
 
 # ---- Other people's estimators -------------------------------------------------------------------
@@ -347,15 +346,18 @@ def render_challenge(document: Mapping[str, Any], *, folder: Path | None = None)
 
 def contest_parts(study: Mapping[str, Any]) -> dict[str, Any]:
     """See the estimators of a benchmark as parts, one for each mode."""
-    parts: dict[str, Any] = {}
-    for who, entry in study["estimators"].items():
-        for mode, scored in entry.items():
-            if isinstance(scored, Mapping):
-                about = {"kind": "trials", "mode": mode, "about": "", "trials": study["trials"]}
-                paired = study["paired"].get(mode, {})
-                part = parts.setdefault(mode, {**about, "estimators": {}, "paired": paired})
-                part["estimators"][who] = scored
-    return parts
+    every = study["estimators"].items()
+    return {
+        mode: {
+            "mode": mode,
+            "about": "",
+            "trials": study["trials"],
+            "estimators": {who: entry[mode] for who, entry in every if mode in entry},
+            "paired": study["paired"].get(mode, {}),
+        }
+        for mode in MODES
+        if any(mode in entry for _, entry in every)
+    }
 
 
 def contest_sections(study: Mapping[str, Any], drawn: Mapping[str, Markup]) -> list[Section]:
@@ -390,21 +392,20 @@ def contest_sections(study: Mapping[str, Any], drawn: Mapping[str, Markup]) -> l
 
 def _map_section(found: Mapping[str, Any], svg: Markup) -> Section:
     """Say who is best where, in a map and with all who are as good in a table."""
-
-    def cell(row: Any, key: str) -> Any:
-        p, r, c = row
-        return found["parameters"][p][key][r][c]
-
+    rows = []
+    for name in _named(found["parameters"]):
+        for row, column in np.ndindex(len(found["height_nm"]), len(found["photons"])):
+            cell = {key: table[row][column] for key, table in found["parameters"][name].items()}
+            at = {"height": found["height_nm"][row], "photons": found["photons"][column]}
+            rows.append({"parameter": LABELS[name], **at, **cell})
     columns = [
-        worded("parameter", lambda row: LABELS[row[0]]),
-        numeric("height [nm]", lambda row: number(found["height_nm"][row[1]])),
-        numeric("photons", lambda row: number(found["photons"][row[2]])),
-        worded("best", lambda row: cell(row, "best") or "—"),
-        numeric("information kept", lambda row: number(cell(row, "kept"), 2)),
-        worded("as good", lambda row: ", ".join(cell(row, "equal") or ()) or "—"),
+        worded("parameter", "parameter"),
+        numeric("height [nm]", of("height")),
+        numeric("photons", of("photons")),
+        worded("best", lambda row: row["best"] or "—"),
+        numeric("information kept", of("kept", number, 2)),
+        worded("as good", lambda row: ", ".join(row["equal"] or ()) or "—"),
     ]
-    places = np.ndindex(len(found["height_nm"]), len(found["photons"]))
-    rows = [(p, *place) for p in _named(found["parameters"]) for place in list(places)]
     caption = (
         "Numbers are the information that the best one keeps, of "
         f"{found['trials']} particles each; + where another is as good, by the interval of the "
@@ -498,7 +499,7 @@ _SCORES = (
     numeric("spread / CRB", _interval("spread_over_crb")),
     numeric("/ Holevo", of("spread_over_holevo")),
     numeric("/ QCRB", of("spread_over_qcrb")),
-    numeric("bias", lambda e: f"{number(e.get('bias'))} ± {number(e.get('bias_se'), 2)}"),
+    numeric("bias", _bias),
     numeric("rmse", of("rmse")),
     numeric("pull σ", _interval("pull_std")),
     numeric("68 %", of("coverage68", percent)),
@@ -554,32 +555,25 @@ def _recall(part: Mapping[str, Any]) -> Table:
 
 def _best_table(curves: Mapping[str, Any]) -> Table:
     """Say who is best where: the highest efficiency at each point, of each parameter."""
-    rows = [
-        (label, curves[axis], k)
-        for axis, (label, _) in _AXES.items()
-        if axis in curves
-        for k in range(len(curves[axis]["at"]))
-    ]
-
-    def best(name: str) -> Callable[[Any], str]:
-        def cell(row: Any) -> str:
-            _, curve, k = row
-            lines = curve["estimators"].items()
-            reached = [
-                (floats(line[name]["efficiency_crb"])[k], who)
-                for who, line in lines
-                if name in line
-            ]
-            known = [pair for pair in reached if math.isfinite(pair[0])]
-            most, who = max(known, key=lambda pair: pair[0], default=(math.nan, ""))
-            return f"{who} {number(float(most), 2)}" if known else "—"
-
-        return cell
-
+    rows = []
+    for axis, (label, _) in _AXES.items():
+        curve = curves.get(axis, {"at": ()})
+        for k, at in enumerate(curve["at"]):
+            row = {"along": label, "at": at}
+            for name in PARAMETERS:
+                reached = {
+                    who: floats(line[name]["efficiency_crb"])[k]
+                    for who, line in curve["estimators"].items()
+                    if name in line
+                }
+                known = {who: value for who, value in reached.items() if math.isfinite(value)}
+                best = max(known, key=lambda who, known=known: known[who], default="")
+                row[name] = f"{best} {number(float(known[best]), 2)}" if best else "—"
+            rows.append(row)
     columns = [
-        worded("along", 0),
-        numeric("at", lambda row: number(row[1]["at"][row[2]])),
-        *(worded(LABELS[p], best(p)) for p in PARAMETERS),
+        worded("along", "along"),
+        numeric("at", of("at")),
+        *(worded(LABELS[name], name) for name in PARAMETERS),
     ]
     return tabulate(rows, columns, "Where each is best, with its efficiency")
 
@@ -683,8 +677,7 @@ def _map_figure(found: Mapping[str, Any], names: Sequence[str]) -> Figure:
 
 
 def _recall_figure(found: Mapping[str, Any]) -> Figure:
-    figure = new_figure(5.0, 3.9)
-    axes = figure.add_subplot()
+    figure, axes = one_panel(5.0, 3.9)
     at = found["mass_kda"]
     axes.plot(at, floats(found["matched_filter"]), color=INK, label="best possible")
     for k, (who, line) in enumerate(found["estimators"].items()):

@@ -344,7 +344,7 @@ def _precision_table(analysis: Analysis, precision: Sequence[Precision]) -> Tabl
         numeric("σ / CRB", of("over_crb"), "median of the rows' ratios; near 1 by construction"),
         numeric(
             "measured / CRB",
-            of("measured_text"),
+            "measured_text",
             f"measured spread over the bound, with its 95 % interval: {where}",
         ),
         numeric(
