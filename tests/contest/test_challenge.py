@@ -83,15 +83,12 @@ def test_the_same_seed_gives_the_same_bytes(folder: Path, tmp_path: Path) -> Non
     assert other["files"] != again["files"]
 
 
-def test_stacks_are_read_as_they_were_drawn(challenge: Challenge, folder: Path) -> None:
+def test_stacks_are_as_they_were_drawn_and_say_nothing_of_the_truth(challenge, folder) -> None:
     with open_stack(folder / challenge.events("stack")[0]["file"]) as stack:
         assert stack.shape == (12, 17, 17)
         frames = stack.read(0, 12).astype(float)
     assert frames[:6].mean() == pytest.approx(2e4, rel=0.01)
     assert np.var(frames[:6], axis=0, ddof=1).mean() == pytest.approx(2e4, rel=0.1)
-
-
-def test_what_participants_get_says_nothing_of_the_truth(folder: Path) -> None:
     for path in [*(folder / "config").iterdir(), folder / "manifest.json"]:
         text = path.read_text(encoding="utf-8")
         assert "[simulation" not in text
@@ -235,12 +232,8 @@ def test_false_alarms_and_misses_are_counted(challenge, estimates, tmp_path) -> 
     assert light["recall"] == 0.0  # a false alarm of 1300 kDa stands above all of them
     assert heavy["recall"] > 0.5
     assert "stack" not in [p for p, part in found["parts"].items() if part["estimators"]]
-
-
-def test_a_table_that_is_called_as_a_movie_is_of_that_movie(challenge, estimates, tmp_path) -> None:
-    table = estimates[estimates["file"].str.startswith("movies")].drop(columns=["event", "file"])
-    (tmp_path / "somebody").mkdir()
-    found = _scored(challenge, table, tmp_path / "somebody" / "movie.csv")
+    (tmp_path / "somebody").mkdir()  # whose table is called as the movie is, and names no file
+    found = _scored(challenge, table.drop(columns="file"), tmp_path / "somebody" / "movie.csv")
     assert found["parts"]["movie"]["estimators"]["somebody"]["failed"] == 0
 
 

@@ -189,11 +189,7 @@ def test_estimators_are_found_by_name_or_function(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("iscat_contest.estimators.find_spec", lambda _: None)
     with pytest.raises(ia.ConfigError, match="--no-deps piscat"):
         find_estimator("piscat").load()
-
-
-def test_other_packages_offer_theirs(monkeypatch: pytest.MonkeyPatch) -> None:
-    theirs = EntryPoint("theirs", "json:dumps", GROUP)
-    found = {GROUP: [theirs]}
+    found = {GROUP: [EntryPoint("theirs", "json:dumps", GROUP)]}  # of another package
     monkeypatch.setattr("iscat_contest.estimators.entry_points", lambda *, group: found[group])
     assert known_estimators()[-1].name == "theirs"
     assert find_estimator("theirs").load() is json.dumps
@@ -238,16 +234,13 @@ def test_a_process_that_hangs_or_dies_is_counted(name, limit_s, said, drawn, rep
     assert said in next(iter(found[0].failures))
 
 
-def test_one_bad_region_costs_no_other(drawn) -> None:
+def test_one_bad_region_costs_no_other_and_any_amplitude_becomes_a_mass(drawn) -> None:
     some = answer(estimators_for_tests.raises_for_some, drawn.job)
     answered = int(np.isfinite(some.columns["x_nm"]).sum())
     assert 0 < answered < COUNTED
     assert some.failures == {"ValueError: a bad one": COUNTED - answered}
     assert some.peak_mb > 1
     assert some.seconds >= 0
-
-
-def test_an_amplitude_of_any_unit_becomes_a_mass(drawn) -> None:
     found = answer(estimators_for_tests.amplitude_of_the_middle, drawn.job)
     assert np.median(found.columns["mass_kda"]) == pytest.approx(1000, rel=0.1)
     assert np.all(found.columns["sigma_mass_kda"] > 0)

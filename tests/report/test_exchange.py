@@ -54,9 +54,6 @@ def test_trackpy_finds_the_mean_squared_displacement_that_d_errors_and_blur_pred
     predicted = 4 * D * (lag - blur_s) + 4 * (SIGMA_NM / 1e3) ** 2
     error = found.std(axis=1) / math.sqrt(found.shape[1])
     assert np.all(np.abs(found.mean(axis=1) - predicted) < 4 * error)
-
-
-def test_trackpy_has_places_in_pixels_and_errors_beside_them() -> None:
     table = to_trackpy(_fits(2))
     assert list(table.columns) == ["y", "x", "frame", "particle", "mass", "signal", "ep", "z"]
     assert np.allclose(table["ep"], SIGMA_NM / PIXEL_NM)
@@ -79,33 +76,31 @@ def test_napari_is_given_sorted_tracks_with_each_frame_once() -> None:
 
 
 def test_the_command_writes_what_the_programs_read(folder: Path, capsys) -> None:
-    assert main(["export", str(folder), "--to", "trackpy"]) == 0
-    written = folder.parent / "moving.trackpy.csv"
+    export = ["export", str(folder), "--to"]
+    assert main([*export, "trackpy"]) == 0
+    written, array = folder.parent / "moving.trackpy.csv", folder.parent / "here.npy"
     assert f"3 tracks in {written}" in capsys.readouterr().out
     assert pd.read_csv(written)["particle"].nunique() == 3
-    array = folder.parent / "here.npy"
-    assert main(["export", str(folder), "--to", "napari", "--out", str(array)]) == 0
+    assert main([*export, "napari", "--out", str(array)]) == 0
     assert np.load(array).shape == (300, 4)
-    assert main(["export", str(folder), "--to", "trackpy"]) == 1
+    assert main([*export, "trackpy"]) == 1
     assert "--overwrite" in capsys.readouterr().err
-    assert main(["export", str(folder), "--to", "trackpy", "--overwrite"]) == 0
+    assert main([*export, "trackpy", "--overwrite"]) == 0
 
 
 def test_what_cannot_be_exported_is_refused(folder: Path) -> None:
-    with pytest.raises(DataError, match="PhotoMol reads landings"):
-        export_result(folder, "photomol")
-    with pytest.raises(ConfigError, match="choose one of trackpy, napari, photomol, picasso"):
-        export_result(folder, "imaris")  # type: ignore[arg-type]
-    with pytest.raises(DataError, match="does not say how large the movie is"):
-        export_result(folder, "picasso")
-    with pytest.raises(DataError, match=r"let `out` end in \.hdf5"):
-        export_result(folder, "picasso", out=folder / "locs.yaml")
+    def refused(layout: Any, match: str, out: Path | None = None) -> None:
+        with pytest.raises((DataError, ConfigError), match=match):
+            export_result(folder, layout, out=out)
+
+    refused("photomol", "PhotoMol reads landings")
+    refused("imaris", "choose one of trackpy, napari, photomol, picasso")
+    refused("picasso", "does not say how large the movie is")
+    refused("picasso", r"let `out` end in \.hdf5", folder / "locs.yaml")
     (folder / "fits.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(DataError, match="`fits`: has no column event, frame"):
-        export_result(folder, "napari")
+    refused("napari", "`fits`: has no column event, frame")
     (folder / "fits.csv").unlink()
-    with pytest.raises(DataError, match=r"holds no fits\.csv"):
-        export_result(folder, "napari")
+    refused("napari", r"holds no fits\.csv")
     assert [path.name for path in folder.iterdir()] == ["tracks.csv"]
 
 
@@ -183,20 +178,13 @@ def test_picasso_finds_localisations_and_the_size_of_the_movie(landings: Path) -
     written.path.unlink()
     with pytest.raises(DataError, match=r"landing\.picasso\.yaml: exists already"):
         export_result(landings, "picasso")
-
-
-def test_picasso_gets_the_same_columns_of_a_movie_without_particles(landings: Path) -> None:
-    written = export_result(landings, "picasso")
-    with h5py.File(written.path) as file:
-        expected = file["locs"].dtype
-    table = pd.read_csv(landings / "fits.csv")
+    table = pd.read_csv(landings / "fits.csv")  # of no particles the columns are the same
     table.iloc[:0].to_csv(landings / "fits.csv", index=False)
-    written = export_result(landings, "picasso", overwrite=True)
-    assert written.text == "0 events"
+    assert export_result(landings, "picasso", overwrite=True).text == "0 events"
     with h5py.File(written.path) as file:
         assert file["locs"].shape == (0,)
-        assert set(file["locs"].dtype.names) <= set(expected.names)
-        assert file["locs"].dtype["lpx"] == expected["lpx"]
+        assert set(file["locs"].dtype.names) <= set(names)
+        assert file["locs"].dtype["lpx"] == np.float32
 
 
 def test_heights_and_tracks_reach_picasso() -> None:
@@ -208,13 +196,6 @@ def test_heights_and_tracks_reach_picasso() -> None:
     tracks = to_picasso(_fits(3).assign(snr=9.0, n_scattered=1e4), tracked=True)
     assert tracks["group"].nunique() == 3
     assert len(tracks) == 300
-
-
-def test_landings_are_points_and_features(landings: Path) -> None:
-    points = np.load(export_result(landings, "napari").path)
-    np.testing.assert_allclose(points, _good()[["frame", "y_px", "x_px"]], rtol=1e-8)
-    features = pd.read_csv(export_result(landings, "trackpy").path)
-    assert list(features.columns) == ["y", "x", "frame", "mass", "signal", "ep", "z"]
 
 
 @pytest.mark.parametrize("layout", ["photomol", "picasso"])
@@ -230,12 +211,15 @@ def test_species_are_the_same_after_a_round_trip(landings: Path, layout: Any) ->
     assert back.findings == own.findings == ()
 
 
-def test_tables_without_masses_say_so(landings: Path, tmp_path: Path) -> None:
-    features = export_result(landings, "trackpy").path
+def test_landings_are_points_and_features_without_masses(landings: Path, tmp_path: Path) -> None:
+    features, points = (export_result(landings, name).path for name in ("trackpy", "napari"))
+    np.testing.assert_allclose(np.load(points), _good()[["frame", "y_px", "x_px"]], rtol=1e-8)
+    names = ["y", "x", "frame", "mass", "signal", "ep", "z"]
+    assert list(pd.read_csv(features).columns) == names
     with pytest.raises(DataError, match="trackpy's, whose mass is a brightness"):
         event_table(features)
     with pytest.raises(DataError, match="neither an HDF5 file nor a text file"):
-        event_table(export_result(landings, "napari").path)
+        event_table(points)
     locs = to_picasso(_landings())
     for left_out, match in (("mass_kda", "photons and no mass"), ("", "and not events")):
         path = tmp_path / f"locs{left_out}.hdf5"

@@ -47,8 +47,8 @@ def test_the_step_is_drawn_where_it_was_fitted() -> None:
     left, right = float(scale["150"].get("x", "")), float(scale["350"].get("x", ""))
     per_frame = (right - left) / 200
     path = drawn["step"][0].get("d", "")
-    begin, before, turn, after, end = (float(v) for v in path[1:].replace("H", " ").replace(
-        "V", " ").split())  # fmt: skip
+    numbers = path[1:].replace("H", " ").replace("V", " ").split()
+    begin, before, turn, after, end = map(float, numbers)
     assert before == pytest.approx(zero, abs=0.11)
     assert after == pytest.approx(down, abs=0.11)
     for x, frame in ((begin, 170), (turn, 250), (end, 310)):
@@ -62,8 +62,8 @@ def test_frames_that_were_left_out_interrupt_the_curve_and_means_stay_on_one_sid
     trace.contrast[10:13] = np.nan
     drawn = _parsed(trace)
     assert drawn["frames"][0].get("d", "").count("M") == 2
-    dots = [tuple(map(float, dot.split("h")[0].split()))
-            for dot in drawn["means"][0].get("d", "")[1:].split("M")]  # fmt: skip
+    marks = drawn["means"][0].get("d", "")[1:].split("M")
+    dots = [tuple(map(float, mark.split("h")[0].split())) for mark in marks]
     assert len({y for _, y in dots}) == 2
     assert [y for x, y in dots if x < 150] == [dots[0][1]] * sum(x < 150 for x, _ in dots)
 

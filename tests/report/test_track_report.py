@@ -47,19 +47,10 @@ def test_spheres_lie_on_lines_of_constant_index() -> None:
     assert not track_figures.has_plane(analysis)
     assert analysis.tracks is not None
     sizes = np.linspace(60.0, 180.0, len(analysis.tracks))
-    tracks = analysis.tracks.assign(
-        diameter_nm=sizes, sigma_diameter_nm=5.0, optical_diameter_nm=sizes,
-        sigma_optical_diameter_nm=1.0,
-    )  # fmt: skip
-    toml = """
-[particle]
-kind = "silica"
-model = "mie"
-[background]
-frames = [0, 9]
-[fit]
-mode = "track"
-"""
+    errors = {"sigma_diameter_nm": 5.0, "sigma_optical_diameter_nm": 1.0}
+    tracks = analysis.tracks.assign(diameter_nm=sizes, optical_diameter_nm=sizes, **errors)
+    toml = 'fit.mode = "track"\nbackground.frames = [0, 9]\nparticle.model = "mie"\n'
+    toml += 'particle.kind = "silica"\n'
     spheres = replace(analysis, tracks=tracks, config_toml=toml)
     assert track_figures.has_plane(spheres)
     (axes,) = track_figures.size_plane(spheres).axes
