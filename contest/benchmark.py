@@ -216,7 +216,7 @@ def _scores(setting: Setting, found: Trials, ranked: PosteriorRanks) -> dict[str
                     "failed": int(miss.size - finite.size),
                 }
         widths = ranked.width_over_crb[ranked.kept, i]
-        covered = {}
+        covered: dict[str, Any] = {}
         for level, all_inside in ((68, ranked.inside68), (95, ranked.inside95)):
             inside = all_inside[ranked.kept, i]
             covered[f"posterior_coverage{level}"] = share(inside)

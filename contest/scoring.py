@@ -78,7 +78,7 @@ class _Group:
     @property
     def truths(self) -> FloatArray:
         """Parameters of the particles, shape (n, 4)."""
-        return self.events[list(PARAMETERS)].to_numpy(dtype=float)
+        return np.asarray(self.events[list(PARAMETERS)], dtype=float)
 
 
 def score_challenge(

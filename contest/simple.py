@@ -130,7 +130,7 @@ def _fitted(
             u, v, g = bell(p)
             by_width = p[0] * g / p[3]
             parts = (g, by_width * u, by_width * v, by_width * (u**2 + v**2), np.ones_like(g))
-            return np.stack(parts, axis=-1).reshape(-1, 5) * of(p)[1]
+            return np.asarray(np.stack(parts, axis=-1).reshape(-1, 5) * of(p)[1])
 
         begin = [0.8 * setup.polarity, *starts[i], setup.psf_sigma_nm / pixel, 0.0]
         how: dict[str, Any] = {"method": "lm", "max_nfev": _EVALUATIONS}
@@ -140,7 +140,7 @@ def _fitted(
         noise = 1.0 if is_standard else 2 * found.cost / max(found.fun.size - 5, 1)
         variance = np.diag(np.linalg.pinv(found.jac.T @ found.jac)) * noise
         to_image = np.array([scale, pixel, pixel, pixel, scale])
-        return np.array([found.x, np.sqrt(np.maximum(variance, 0.0))]) * to_image
+        return np.asarray([found.x, np.sqrt(np.maximum(variance, 0.0))] * to_image)
 
     found = np.stack([fit(i) for i in range(len(images))])
     names = ("amplitude", "x_nm", "y_nm")

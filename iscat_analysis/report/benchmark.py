@@ -567,7 +567,7 @@ def _best_table(curves: Mapping[str, Any]) -> Table:
                     if name in line
                 }
                 known = {who: value for who, value in reached.items() if math.isfinite(value)}
-                best = max(known, key=lambda who, known=known: known[who], default="")
+                best = max(known, key=known.__getitem__, default="")
                 row[name] = f"{best} {number(float(known[best]), 2)}" if best else "—"
             rows.append(row)
     columns = [

@@ -72,19 +72,6 @@ class EventDetail(NamedTuple):
     sliding: str
 
 
-@dataclass(frozen=True)
-class FilmShown:
-    """One film as the page shows it."""
-
-    track: int
-    why: str
-    scales: str
-    film: str
-    still: str
-    width: int
-    height: int
-
-
 # ---- Images and films inside the page ------------------------------------------------------------
 
 
@@ -105,8 +92,8 @@ def event_details(analysis: Analysis, table: pd.DataFrame) -> dict[int, EventDet
     return packed
 
 
-def films_shown(analysis: Analysis, folder: Path | None = None) -> Iterator[FilmShown]:
-    """Make the films of the page, as many as `FILM_BYTES` hold."""
+def films_shown(analysis: Analysis, folder: Path | None = None) -> Iterator[dict[str, Any]]:
+    """Make the films of the page, as many as `FILM_BYTES` hold, with what is said of each."""
     spent = 0
     for film in analysis.films:
         scale = _Scale.of(film, analysis.scheme)
@@ -119,14 +106,11 @@ def films_shown(analysis: Analysis, folder: Path | None = None) -> Iterator[Film
             (folder / f"track_{film.track:04d}.webp").write_bytes(moving)
         still = io.BytesIO()
         pictures[0].save(still, "PNG")
-        yield FilmShown(
-            film.track,
-            film.why,
-            f"frames {film.frames[0]} to {film.frames[-1]}; {scale.text}",
-            base64.b64encode(moving).decode("ascii"),
-            base64.b64encode(still.getvalue()).decode("ascii"),
-            *pictures[0].size,
-        )
+        wide, tall = pictures[0].size
+        scales = f"frames {film.frames[0]} to {film.frames[-1]}; {scale.text}"
+        about = {"track": film.track, "why": film.why, "scales": scales}
+        shown = {"film": _base64(moving), "still": _base64(still.getvalue())}
+        yield {**about, **shown, "width": wide, "height": tall}
 
 
 @dataclass(frozen=True)
@@ -196,7 +180,11 @@ def png_of(shades: NDArray[np.uint8], palette: NDArray[np.uint8]) -> str:
     buffer = io.BytesIO()
     # noise never repeats itself: looking for that takes four times as long, and saves nothing
     image.save(buffer, "PNG", transparency=len(palette), compress_type=Image.HUFFMAN_ONLY)
-    return base64.b64encode(buffer.getvalue()).decode("ascii")
+    return _base64(buffer.getvalue())
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")
 
 
 def clip_shown(clip: Clip, low: float, high: float, still: int) -> tuple[Markup, str]:
@@ -422,9 +410,8 @@ def draw_trace(axes: Axes, trace: Trace) -> None:
 def _range(trace: Trace) -> tuple[float, float]:
     """Give the scale: both levels and nearly all frames, and always a proper interval."""
     known = trace.contrast[np.isfinite(trace.contrast)]
-    ends = np.quantile(known, [0.005, 0.995]) if known.size else np.zeros(2)
-    low = min(float(ends[0]), trace.before, trace.after)
-    high = max(float(ends[1]), trace.before, trace.after)
+    ends = np.quantile(known, [0.005, 0.995]).tolist() if known.size else [0.0]
+    low, high = (pick(*ends, trace.before, trace.after) for pick in (min, max))
     margin = 0.04 * (high - low) or 1e-6
     return low - margin, high + margin
 
@@ -446,21 +433,18 @@ def _means(trace: Trace) -> tuple[FloatArray, FloatArray]:
     start = (trace.frame - trace.first) % length
     number = (len(trace.contrast) - start) // length
     parts = trace.contrast[start : start + number * length].reshape(number, length)
-    known = np.isfinite(parts)
-    some = known.any(axis=1)
-    sums = np.where(known, parts, 0.0).sum(axis=1)[some]
-    centres = trace.first + start + (np.flatnonzero(some) + 0.5) * length
-    means: FloatArray = sums / known.sum(axis=1)[some]
-    return np.asarray(centres), means
+    some = np.flatnonzero(np.isfinite(parts).any(axis=1))
+    centres = trace.first + start + (some + 0.5) * length
+    return np.asarray(centres), np.asarray(np.nanmean(parts[some], axis=1))
 
 
 def _curve(levels: FloatArray) -> str:
     """Write a path of one step to the right per value; a missing value interrupts it."""
     text = []
     known = np.flatnonzero(np.isfinite(levels))
-    runs = np.split(known, np.flatnonzero(np.diff(known) > 1) + 1) if known.size else []
-    for run in runs:
+    for run in np.split(known, np.flatnonzero(np.diff(known) > 1) + 1):
         values = levels[run].astype(int)
         steps = "".join(f" 1 {step}" for step in np.diff(values).tolist())
-        text.append(f"M{run[0] + 0.5:g} {values[0]}l{steps[1:].replace(' -', '-')}")
+        if run.size:
+            text.append(f"M{run[0] + 0.5:g} {values[0]}l{steps[1:].replace(' -', '-')}")
     return "".join(text)

@@ -368,10 +368,10 @@ def draw(analysis: Analysis, kind: str) -> Figure:
     main = table[main_quantity(analysis).column].to_numpy(float)
     if kind != "overview" and not np.isfinite(main).any():
         raise DataError(f"{_movie(analysis)}: no event was found, so there is no {kind} to draw")
-    makers = {"overview": overview, "histogram": histogram, "precision": precision}
-    if analysis.tracks is not None:
-        makers["overview"] = track_figures.trajectories
-        makers["histogram"] = lambda analysis, _: track_figures.distributions(analysis)
+    if analysis.tracks is not None and kind == "histogram":
+        return _shown(partial(track_figures.distributions, analysis))
+    field = overview if analysis.tracks is None else track_figures.trajectories
+    makers = {"overview": field, "histogram": histogram, "precision": precision}
     return _shown(partial(makers[kind], analysis, table))
 
 
