@@ -70,8 +70,7 @@ def to_napari(fits: pd.DataFrame) -> FloatArray:
         Track, frame, y and x [px], sorted by track and frame, each frame of a track once:
         ``viewer.add_tracks(…)`` over the movie takes it as it is.
     """
-    rows = tracked_rows(fits)
-    return np.ascontiguousarray(rows[["particle", "frame", "y_px", "x_px"]].to_numpy(float))
+    return _napari(_tracked(fits))
 
 
 def tracked_rows(fits: pd.DataFrame) -> pd.DataFrame:
@@ -109,12 +108,15 @@ def to_photomol(fits: pd.DataFrame, *, masses: bool = True) -> pd.DataFrame:
         ``masses_kDa``, negative for a particle that leaves; and ``sigma_mass_kda`` [kDa] and
         ``snr``, which those programs do not know and ``iscat species`` reads.
     """
-    masses = truth_in("`masses`", masses)
+    return _photomol(_events(fits), truth_in("`masses`", masses))
+
+
+def _photomol(rows: pd.DataFrame, masses: bool) -> pd.DataFrame:
     names = {"frame": "frame_indices", "x_px": "x_coords", "y_px": "y_coords"}
     names["contrast"] = "contrasts"
     if masses:
         names |= {"mass_kda": "masses_kDa", "sigma_mass_kda": "sigma_mass_kda"}
-    table = _renamed(_events(fits), {**names, "snr": "snr"})
+    table = _renamed(rows, {**names, "snr": "snr"})
     return table.astype({"frame_indices": "int64"})
 
 
@@ -138,7 +140,10 @@ def to_picasso(fits: pd.DataFrame, *, tracked: bool = False) -> pd.DataFrame:
         counterpart: a picture with rings has no width of a Gaussian, and its background is divided
         out.  Events are those whose status is ok.
     """
-    rows = _tracked(fits) if truth_in("`tracked`", tracked) else _events(fits)
+    return _picasso((_tracked if truth_in("`tracked`", tracked) else _events)(fits))
+
+
+def _picasso(rows: pd.DataFrame) -> pd.DataFrame:
     rows = rows[rows[["sigma_x_nm", "sigma_y_nm"]].notna().all(axis=1)]
     pixel = _pixel_nm(rows)
     rows = rows.assign(lpx=rows["sigma_x_nm"] / pixel, lpy=rows["sigma_y_nm"] / pixel)
@@ -146,7 +151,7 @@ def to_picasso(fits: pd.DataFrame, *, tracked: bool = False) -> pd.DataFrame:
     names |= {"lpx": "lpx", "lpy": "lpy"}
     if rows["sigma_z_nm"].notna().any():
         names |= {"z_nm": "z", "sigma_z_nm": "lpz"}
-    if tracked:
+    if "particle" in rows:
         names["particle"] = "group"
     names |= {"contrast": "contrast", "snr": "snr"}
     if rows["sigma_mass_kda"].notna().any():
@@ -171,56 +176,48 @@ def export_result(
             raise DataError(f"{taken}: exists already; give another name, or pass `overwrite`")
     if of_picasso and path == yaml_path:
         raise DataError(f"{path}: is the name of Picasso's metadata; let `out` end in .hdf5")
-    tracked = is_file(folder / "tracks.csv")
-    if tracked and layout == "photomol":
+    chosen, noun = (_tracked, "track") if is_file(folder / "tracks.csv") else (_events, "event")
+    if noun == "track" and layout == "photomol":
         raise DataError(
             f"{folder}: holds tracks, and PhotoMol reads landings and leavings; tracks.csv has the "
             "mass of every track"
         )
     try:
-        with open_regular(folder / "fits.csv") as table:
-            fits = pd.read_csv(table, keep_default_na=False, na_values=[""])
+        with open_regular(folder / "fits.csv") as source:
+            fits = pd.read_csv(source, keep_default_na=False, na_values=[""])
         path.parent.mkdir(parents=True, exist_ok=True)
+        rows = chosen(fits)
         if of_picasso:
-            locs, info = to_picasso(fits, tracked=tracked), _metadata(folder, fits)
+            locs, info = _picasso(rows), _metadata(folder, fits)
             with whole_file(yaml_path) as partial_yaml, whole_file(path) as partial:
                 lines = [f"{key}: {json.dumps(value)}\n" for key, value in info.items()]
                 partial_yaml.write_text("".join(lines), encoding="utf-8")  # of which JSON is a part
                 with h5py.File(partial, "w") as file:
                     file.create_dataset("locs", data=locs.to_records(index=False))
                     file.create_dataset("metadata", data=json.dumps([info]))
+        elif layout == "napari":
+            with whole_file(path) as partial, partial.open("wb") as array:
+                np.save(array, _napari(rows))
         else:
+            is_trackpy = layout == "trackpy"
+            table = _trackpy(rows) if is_trackpy else _photomol(rows, _calibrated(folder))
             with whole_file(path) as partial:
-                _write(partial, fits, layout, tracked, folder)
+                write_csv(table, partial)
     except OSError as error:
         named = path if error.filename is None else error.filename
         raise DataError(f"{named}: cannot be read or written ({error.strerror})") from None
     except (KeyError, ValueError) as error:  # a table that is none of ours
         raise DataError(f"{folder / 'fits.csv'}: is not a table of fits ({error})") from None
-    if tracked:
-        return Exported(path, count(int(_tracked(fits)["particle"].nunique()), "track"))
-    good = len(_events(fits))
+    if noun == "track":
+        return Exported(path, count(int(rows["particle"].nunique()), noun))
     notes = []
-    if left := len(fits) - good:
+    if left := len(fits) - len(rows):
         notes.append(f"{count(left, 'event')} whose status is not ok, or without a place, left out")
     if layout == "photomol" and not _calibrated(folder):
         fixed = _summary(folder).get("mode") == "localize"
         why = "mode localize fits no mass" if fixed else "without [calibration] there are no masses"
         notes.append(f"contrasts alone, for {why}")
-    return Exported(path, count(good, "event"), tuple(notes))
-
-
-def _write(partial: Path, fits: pd.DataFrame, layout: Layout, tracked: bool, folder: Path) -> None:
-    if layout == "napari":
-        array = to_napari(fits) if tracked else _events(fits)[["frame", "y_px", "x_px"]].to_numpy()
-        with partial.open("wb") as file:
-            np.save(file, np.ascontiguousarray(array, dtype=np.float64))
-        return
-    if layout == "photomol":
-        table = to_photomol(fits, masses=_calibrated(folder))
-    else:
-        table = to_trackpy(fits) if tracked else _trackpy(_events(fits))
-    write_csv(table, partial)
+    return Exported(path, count(len(rows), noun), tuple(notes))
 
 
 def _metadata(folder: Path, fits: pd.DataFrame) -> dict[str, Any]:
@@ -254,6 +251,14 @@ def _calibrated(folder: Path) -> bool:
     """Whether masses are calibrated; true for a table of unknown origin."""
     summary = _summary(folder)
     return summary.get("mode") != "localize" and summary.get("mass_scale") != "absolute model"
+
+
+def _napari(rows: pd.DataFrame) -> FloatArray:
+    """Give places, each frame of a track once if they are linked."""
+    names = ["frame", "y_px", "x_px"]
+    if "particle" in rows:
+        names, rows = ["particle", *names], rows.drop_duplicates(["particle", "frame"])
+    return np.ascontiguousarray(rows[names], dtype=np.float64)
 
 
 def _trackpy(rows: pd.DataFrame) -> pd.DataFrame:
