@@ -98,8 +98,9 @@ def test_tracks_are_left_out_for_their_pictures_and_not_for_their_motion() -> No
     diameter, sigma = draw(1, 30, 0.02)
     flags = ["ok"] * 10 + ["near_wall"] * 10 + ["not_free;ambiguous_size"] * 5 + ["poor_fits"] * 5
     tracks = pd.DataFrame(
-        {"optical_diameter_nm": diameter, "sigma_optical_diameter_nm": sigma, "flags": flags}
-    )
+        {"optical_diameter_nm": diameter, "sigma_optical_diameter_nm": sigma, "flags": flags,
+         "mass_kda": 500.0}
+    )  # fmt: skip
     sizes = sizes_of_tracks(tracks, seed=1)
     assert sizes is not None
     assert sizes.spheres == 20
