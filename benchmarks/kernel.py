@@ -71,30 +71,23 @@ def strips(repeats, profile, f):  # type: ignore[no-untyped-def]
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
 def gradients(repeats, profile, lens, pixels, theta, g):  # type: ignore[no-untyped-def]
     for k in range(repeats):
-        image.signal_gradient(profile, lens, pixels, theta[0] + 0.1 * (k % 7), theta[1], 1e-3, g)
+        theta[0] += 0.1 * (k % 7 - 3)
+        image.signal_gradient(profile, lens, pixels, theta, g)
 
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
-def values(repeats, kind, data, g):  # type: ignore[no-untyped-def]
-    total = 0.0
+def scores(repeats, measured, g, score, fisher):  # type: ignore[no-untyped-def]
     for _ in range(repeats):
-        total += scoring.image_value(kind, data, 1.0, g)
-    return total
-
-
-@njit(error_model="numpy")  # type: ignore[untyped-decorator]
-def scores(repeats, kind, data, g, score, fisher):  # type: ignore[no-untyped-def]
-    for _ in range(repeats):
-        scoring.image_score(kind, data, 1.0, g, score, fisher)
+        scoring.image_score(measured, 1.0, g, (score, fisher))
 
 
 @njit(error_model="numpy")  # type: ignore[untyped-decorator]
 def passes(  # type: ignore[no-untyped-def]
-    repeats, axial, theta, start, stop, profile, lens, pixels, kind, data, score, fisher
+    repeats, axial, theta, start, stop, profile, lens, pixels, measured, score, fisher
 ):
     for _ in range(repeats):
         radial.profile_at(axial, theta[2], start, stop, profile)
-        scoring.score_pass(profile, lens, pixels, kind, data, theta, score, fisher)
+        scoring.score_pass(profile, lens, pixels, measured, theta, (score, fisher))
 
 
 def seconds(run: Callable[..., object], repeats: int, *arguments: object) -> float:
@@ -205,7 +198,7 @@ def parts(repeats: int) -> dict[str, float]:
     """Nanoseconds of each part: of a pass, then of a pixel."""
     likelihood, start, _ = Batch(SIDE, 1).sets[0]
     axial = likelihood.model.axial_table
-    lens, pixels, kind, data = likelihood._arguments
+    lens, pixels, measured = likelihood._arguments
     profile = scoring.blank_profile(axial, lens, 2)
     _, stop = scoring.span(lens, pixels, start, axial.heights.shape[3])
     turn = seconds(heights, repeats, axial, start[2], stop, profile)
@@ -218,8 +211,7 @@ def parts(repeats: int) -> dict[str, float]:
     found = {
         "quintics": horner,
         "fields": whole - horner,
-        "value": seconds(values, repeats, kind, data, g),
-        "score_and_fisher": seconds(scores, repeats, kind, data, g, np.zeros(5), np.zeros((5, 5))),
+        "value_and_score": seconds(scores, repeats, measured, g, np.zeros(5), np.zeros((5, 5))),
     }
     per = 1e9 / SIDE**2
     parts = {f"{name}_ns_per_pixel": per * took for name, took in found.items()}

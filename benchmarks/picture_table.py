@@ -81,12 +81,12 @@ def passes(pixels: int) -> tuple[float, float]:
 
     def radial() -> None:
         profile_at(axial, theta[2], start, stop, profile)
-        score_pass(profile, model.lens, samples, 0, data, theta, score, fisher)
+        score_pass(profile, model.lens, samples, (0, data), theta, (score, fisher))
 
     def tabulated() -> None:
         blend(table, weights[0], weights[1], value, slope)
-        score_pass(picture, lens, samples, 0, data, theta, score, fisher)
-        value_pass(picture, lens, samples, 0, data, theta)  # the image of the slope along z
+        score_pass(picture, lens, samples, (0, data), theta, (score, fisher))
+        value_pass(picture, lens, samples, (0, data), theta)  # the image of the slope along z
 
     radial(), tabulated()
     one, other = least_times([radial, tabulated], 60, 20)

@@ -1,15 +1,15 @@
 """Arrays that were used last, as many as have room: what is used again soon is not made again.
 
-`memoize` keeps results of a function that take long to compute.
+`memoize` keeps results of a function that take long to compute, `kept` those of a method.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from functools import lru_cache
+from functools import lru_cache, wraps
 from threading import Lock
-from typing import Generic, TypeVar, TypeVarTuple
+from typing import Any, Generic, TypeVar, TypeVarTuple
 
 V = TypeVar("V")
 
@@ -63,3 +63,24 @@ def memoize(size: int, make: Callable[[*Key], T]) -> Callable[[*Key], T]:
         return found[0]
 
     return get
+
+
+def kept(size: int) -> Callable[[Callable[[Any, *Key], T]], Callable[[Any, *Key], T]]:
+    """Let each object keep the last few results of a method."""
+
+    def decorated(method: Callable[[Any, *Key], T]) -> Callable[[Any, *Key], T]:
+        name = f"_kept_{method.__name__}"
+
+        @wraps(method)
+        def get(self: Any, *key: *Key) -> T:
+            def own(*key: *Key) -> T:
+                return method(self, *key)
+
+            held: dict[str, Callable[[*Key], T]] = vars(self)
+            if name not in held:
+                held.setdefault(name, memoize(size, own))
+            return held[name](*key)
+
+        return get
+
+    return decorated

@@ -20,7 +20,7 @@ from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, LatticeLens, Len
 from iscat_analysis._kernels.loops import copy_line, whole
 from iscat_analysis._kernels.radial import AxialTable, profile_at
 from iscat_analysis._kernels.scoring import span
-from iscat_analysis._kernels.stamp import add_stamp, stamp_gradient
+from iscat_analysis._kernels.stamp import stamp_gradient
 
 Counts = NDArray[np.uint16] | NDArray[np.float32]
 """Types of counts; kernels are compiled for the type of the movie."""
@@ -66,6 +66,14 @@ class Rows(NamedTuple):
     starts: IntArray
     theta: FloatArray
     group: IntArray
+
+
+class Brush(NamedTuple):
+    """Images, and work space to draw one of them: its profile, and its pixels."""
+
+    pictures: Pictures
+    profile: FloatArray
+    image: AnyFloatArray
 
 
 class Canvas(NamedTuple):
@@ -128,61 +136,52 @@ def cut(pixels: Pixels, r0: int, r1: int, c0: int, c1: int) -> Pixels:
 
 
 @kernel(_nrt=False)
-def add_row(
-    pictures: Pictures, field: Field, group: int, theta: FloatArray, sign: float,
-    square: tuple[int, int, int, int], profile: FloatArray, image: FloatArray,
-    total: NDArray[np.float32],
+def draw(
+    pictures: Pictures, group: int, theta: FloatArray, pixels: Pixels, profile: FloatArray,
+    out: AnyFloatArray,
 ) -> None:  # fmt: skip
-    """Add the signal of one row, times a sign, to a square of a frame; `image` is work space."""
-    r0, r1, c0, c1 = square
-    if r1 <= r0:
-        return
+    """Fill `out` with the signal (ny, nx) of one row, or with its gradient as well (ny, 5, nx).
+
+    At one height (ny, BENDS, nx) asks for second derivatives too.
+    """
     table, lens = table_of(pictures, group), lens_of(pictures, group)
-    pixels = cut(field.pixels, r0, r1, c0, c1)
-    _add_row(table, lens, pictures.nodes, theta, sign, pixels, profile, image, total[r0:r1, c0:c1])
+    _draw(table, lens, pictures.nodes, theta, pixels, profile, out)
+
+
+@kernel(_nrt=False)
+def _draw(
+    table: AxialTable, lens: Lens, nodes: AnyFloatArray, theta: FloatArray, pixels: Pixels,
+    profile: FloatArray, out: AnyFloatArray,
+) -> None:  # fmt: skip
+    """Do the same as `draw`; the types of the lens and of `out` choose the compiled branches."""
+    if len(lens) == STAMP:
+        if out.ndim == 2:
+            signal_image(nodes, lens, pixels, theta, out)
+        else:
+            stamp_gradient(nodes, lens, pixels, theta, out)
+        return
+    start, stop = span(lens, pixels, theta, table.heights.shape[3])
+    profile_at(table, theta[2], start, stop, profile)
+    if out.ndim == 2:
+        signal_image(profile, lens, pixels, theta, out)
+    else:
+        signal_gradient(profile, lens, pixels, theta, out)
 
 
 @kernel(_nrt=False)
 def _add_row(
-    table: AxialTable, lens: Lens, nodes: AnyFloatArray, theta: FloatArray, sign: float,
-    pixels: Pixels, profile: FloatArray, image: FloatArray, there: NDArray[np.float32],
+    brush: Brush, field: Field, group: int, theta: FloatArray, sign: float,
+    square: tuple[int, int, int, int], total: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Do the same as `add_row`; the type of the lens chooses the compiled branches."""
-    if len(lens) == STAMP:
-        add_stamp(nodes, lens, pixels, theta[0], theta[1], theta[3], sign, there)
+    """Add the signal of one row, times a sign, to a square of a frame."""
+    r0, r1, c0, c1 = square
+    if r1 <= r0 or c1 <= c0:
         return
-    out = image[: there.size].reshape(there.shape)
-    start, stop = span(lens, pixels, theta, table.heights.shape[3])
-    profile_at(table, theta[2], start, stop, profile)
-    signal_image(profile, lens, pixels, theta[0], theta[1], theta[3], out)
-    add(there, sign, out)
-
-
-@kernel(_nrt=False)
-def draw_gradient(
-    pictures: Pictures, group: int, theta: FloatArray, pixels: Pixels,
-    profile: FloatArray, out: AnyFloatArray,
-) -> None:  # fmt: skip
-    """Fill `out` (ny, 5, nx) with the signal of one row and its gradient.
-
-    At one height (ny, BENDS, nx) asks for second derivatives as well.
-    """
-    table, lens = table_of(pictures, group), lens_of(pictures, group)
-    _draw_gradient(table, lens, pictures.nodes, theta, pixels, profile, out)
-
-
-@kernel(_nrt=False)
-def _draw_gradient(
-    table: AxialTable, lens: Lens, nodes: AnyFloatArray, theta: FloatArray, pixels: Pixels,
-    profile: FloatArray, out: AnyFloatArray,
-) -> None:  # fmt: skip
-    """Do the same as `draw_gradient`; the type of the lens chooses the compiled branches."""
-    if len(lens) == STAMP:
-        stamp_gradient(nodes, lens, pixels, theta[0], theta[1], theta[3], out)
-        return
-    start, stop = span(lens, pixels, theta, table.heights.shape[3])
-    profile_at(table, theta[2], start, stop, profile)
-    signal_gradient(profile, lens, pixels, theta[0], theta[1], theta[3], out)
+    there = total[r0:r1, c0:c1]
+    image = brush.image[: there.size].reshape(there.shape)
+    pixels = cut(field.pixels, r0, r1, c0, c1)
+    draw(brush.pictures, group, theta, pixels, brush.profile, image)
+    add(there, sign, image)
 
 
 @kernel(fastmath=FAST, _nrt=False)
@@ -226,22 +225,17 @@ def stage(
 
 @kernel(_nrt=False)
 def draw_frames(
-    field: Field, near: Pictures, far: Pictures, rows: Rows, first: int, last: int, canvas: Canvas,
-    near_profile: FloatArray, far_profile: FloatArray, image: FloatArray,
-) -> None:  # fmt: skip
-    """Update frames first…last − 1 of the canvas to the current rows.
-
-    Shapes: `image` (side²,).
-    """
+    field: Field, near: Brush, far: Brush, particles: Rows, first: int, last: int, canvas: Canvas
+) -> None:
+    """Update frames first…last − 1 of the canvas to the current rows."""
     for t in range(first, last):
-        _ready_frame(field, near, far, rows, t, canvas, near_profile, far_profile, image)
+        _draw_frame(field, near, far, particles, t, canvas)
 
 
 @kernel(_nrt=False)
-def _ready_frame(
-    field: Field, near: Pictures, far: Pictures, particles: Rows, t: int, canvas: Canvas,
-    near_profile: FloatArray, far_profile: FloatArray, image: FloatArray,
-) -> None:  # fmt: skip
+def _draw_frame(
+    field: Field, near: Brush, far: Brush, particles: Rows, t: int, canvas: Canvas
+) -> None:
     """Update a frame of the canvas to the current rows.
 
     If rows have moved too far from their rings, these rings are drawn again: those of these rows
@@ -262,34 +256,32 @@ def _ready_frame(
         total[:] = 0.0
         canvas.drawn[t] = True
     for r in range(first, last):
-        rings, square, now = canvas.rings[r], canvas.squares[r], theta[r]
+        rings, square, now, k = canvas.rings[r], canvas.squares[r], theta[r], group[r]
         inner = square_of(field, rings, field.side, rows, columns)
-        outer = square_of(field, rings, field.drawn, rows, columns)
         aside = _is_aside(field, now, rings)
-        k = group[r]
         if aside and not anew:
-            add_row(near, field, k, square, -1.0, inner, near_profile, image, total)
-            _add_rings(far, field, k, rings, -1.0, inner, outer, far_profile, image, total)
+            _add_row(near, field, k, square, -1.0, inner, total)
+            _add_rings(far, field, k, rings, -1.0, total)
         if aside or anew:
             copy_line(now, rings)
             copy_line(now, square)
-            outer = square_of(field, now, field.drawn, rows, columns)
             if field.alike:
-                add_row(far, field, k, now, 1.0, outer, far_profile, image, total)
+                outer = square_of(field, now, field.drawn, rows, columns)
+                _add_row(far, field, k, now, 1.0, outer, total)
                 continue
             inner = square_of(field, now, field.side, rows, columns)
-            add_row(near, field, k, now, 1.0, inner, near_profile, image, total)
-            _add_rings(far, field, k, now, 1.0, inner, outer, far_profile, image, total)
+            _add_row(near, field, k, now, 1.0, inner, total)
+            _add_rings(far, field, k, now, 1.0, total)
             continue
         if _is_other_size(field, now, rings):
             # b P + b² Q minus a P + a² Q is (b - a)/(b + a) times the signal of a + b
             share = (now[3] - rings[3]) / (now[3] + rings[3])
             rings[3] += now[3]
-            _add_rings(far, field, k, rings, share, inner, outer, far_profile, image, total)
+            _add_rings(far, field, k, rings, share, total)
             rings[3] = now[3]
         if _differ(now, square):
-            add_row(near, field, k, square, -1.0, inner, near_profile, image, total)
-            add_row(near, field, k, now, 1.0, inner, near_profile, image, total)
+            _add_row(near, field, k, square, -1.0, inner, total)
+            _add_row(near, field, k, now, 1.0, inner, total)
             copy_line(now, square)
 
 
@@ -319,20 +311,18 @@ def _is_other_size(field: Field, theta: FloatArray, rings: FloatArray) -> bool:
 
 @kernel(_nrt=False)
 def _add_rings(
-    pictures: Pictures, field: Field, group: int, theta: FloatArray, sign: float,
-    inner: tuple[int, int, int, int], outer: tuple[int, int, int, int], profile: FloatArray,
-    image: FloatArray, total: NDArray[np.float32],
+    brush: Brush, field: Field, group: int, theta: FloatArray, sign: float,
+    total: NDArray[np.float32],
 ) -> None:  # fmt: skip
     """Add the signal of one row, times a sign, to the pixels around its fitted square."""
-    top, bottom, left, right = inner
-    r0, r1, c0, c1 = outer
+    rows, columns = total.shape
+    top, bottom, left, right = square_of(field, theta, field.side, rows, columns)
+    r0, r1, c0, c1 = square_of(field, theta, field.drawn, rows, columns)
     if bottom <= top:
         top = bottom = r1
-    for part in (
-        (r0, top, c0, c1), (bottom, r1, c0, c1), (top, bottom, c0, left), (top, bottom, right, c1)
-    ):  # fmt: skip
-        if part[3] > part[2]:
-            add_row(pictures, field, group, theta, sign, part, profile, image, total)
+    beside = (r0, top, c0, c1), (bottom, r1, c0, c1), (top, bottom, c0, left)
+    for part in (*beside, (top, bottom, right, c1)):
+        _add_row(brush, field, group, theta, sign, part, total)
 
 
 @kernel(fastmath=FAST, _nrt=False)

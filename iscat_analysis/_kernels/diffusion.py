@@ -13,6 +13,10 @@ import numpy as np
 from iscat_analysis._kernels import FAST, FloatArray, kernel
 from iscat_analysis._kernels.loops import largest
 
+Moves = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+"""Displacements (c, n) of a track, and of their covariance the diagonals beside one another: of the
+errors (c, n) and (c, n − 1), and of what diffusion adds per D, (n,) and (n − 1,)."""
+
 LOG_2PI = math.log(2.0 * math.pi)
 
 TOGETHER = 8
@@ -26,21 +30,15 @@ _NEWTON, _TOLERANCE = 20, 1e-12  # steps at most; the last one's length over the
 
 @kernel()
 def displacement_likelihood(
-    steps: FloatArray,
-    error: FloatArray,
-    error_next: FloatArray,
-    rate: FloatArray,
-    rate_next: FloatArray,
-    diffusion: float,
+    moves: Moves, diffusion: float
 ) -> tuple[float, float, float, float, float, float]:
     """Log-likelihood of displacements whose covariance is E + D·A, both tridiagonal.
 
     The pivots p_k and residuals z_k of its factorisation are differentiated with respect to D as
     they are made.  Because the covariance is linear in D, the second derivative of its
     log-determinant is −tr[(Σ⁻¹A)²], so that the Fisher information comes along exactly.
-
-    Shapes: `steps` (c, n).
     """
+    steps, error, error_next, rate, rate_next = moves
     axes, n = steps.shape
     total0, total1, total2 = 0.0, 0.0, 0.0
     quad0, quad1, quad2 = 0.0, 0.0, 0.0
@@ -76,14 +74,7 @@ def displacement_likelihood(
 
 
 @kernel(fastmath=FAST)
-def displacement_likelihoods(
-    steps: FloatArray,
-    error: FloatArray,
-    error_next: FloatArray,
-    rate: FloatArray,
-    rate_next: FloatArray,
-    diffusion: FloatArray,
-) -> FloatArray:
+def displacement_likelihoods(moves: Moves, diffusion: FloatArray) -> FloatArray:
     """Log-likelihoods of many D at once, without derivatives.
 
     Each pivot needs the division by the one before it.  The pivots of several D are independent, so
@@ -91,6 +82,7 @@ def displacement_likelihoods(
 
     Shapes: `diffusion` (m,), result (m,).
     """
+    steps, error, error_next, rate, rate_next = moves
     axes, n = steps.shape
     state = np.empty((4, diffusion.size))
     p, z, product, quad = state[0], state[1], state[2], state[3]
@@ -122,29 +114,22 @@ def displacement_likelihoods(
 
 
 @kernel()
-def most_likely_diffusion(
-    steps: FloatArray,
-    error: FloatArray,
-    error_next: FloatArray,
-    rate: FloatArray,
-    rate_next: FloatArray,
-    scale: float,
-) -> float:
+def most_likely_diffusion(moves: Moves, scale: float) -> float:
     """Maximise the likelihood of free diffusion by Newton's method, from one or two values of D."""
     top = 2.0 * scale
-    while displacement_likelihood(steps, error, error_next, rate, rate_next, top)[1] > 0.0:
+    while displacement_likelihood(moves, top)[1] > 0.0:
         top *= 2.0
     grid = np.empty(_GRID_POINTS + 1)
     grid[0] = 0.0
     for k in range(_GRID_POINTS):
         grid[k + 1] = top * _LOWEST_RATIO ** (1.0 - k / (_GRID_POINTS - 1.0))
     for _ in range(_GRIDS):
-        values = displacement_likelihoods(steps, error, error_next, rate, rate_next, grid)
+        values = displacement_likelihoods(moves, grid)
         highest = largest(values)
         best = grid[highest]
         low, high = grid[max(highest - 1, 0)], grid[min(highest + 1, grid.size - 1)]
         for _ in range(_NEWTON):
-            there = displacement_likelihood(steps, error, error_next, rate, rate_next, best)
+            there = displacement_likelihood(moves, best)
             if not there[2] < 0.0:
                 break
             step = -there[1] / there[2]

@@ -13,6 +13,9 @@ from iscat_analysis._kernels import FAST, FloatArray, kernel
 from iscat_analysis._kernels.diffusion import LOG_2PI, TOGETHER
 from iscat_analysis._kernels.loops import copy_line, largest
 
+Track = tuple[FloatArray, FloatArray, FloatArray, float]
+"""Positions (c, n), the variances of their errors (c, n), times between them (n − 1,), exposure."""
+
 _SHORT = 1e-2  # stiffness times exposure below which the moments are computed from a series
 _STIFFNESSES = 10  # number of stiffnesses among which the search begins
 _FIRST, _FINER = 0.3, 0.3  # first distance of the compared points, and the factor of each step
@@ -22,23 +25,16 @@ _MOST_ROUNDS = 100  # largest number of rounds of the search
 
 
 @kernel(fastmath=FAST)
-def harmonic_likelihoods(
-    positions: FloatArray,
-    variance: FloatArray,
-    gaps: FloatArray,
-    exposure: float,
-    diffusion: FloatArray,
-    stiffness: FloatArray,
-) -> FloatArray:
+def harmonic_likelihoods(track: Track, diffusion: FloatArray, stiffness: FloatArray) -> FloatArray:
     """Log-likelihoods of the displacements of a particle in harmonic wells of unknown centre.
 
     The state is the position at the start of an exposure, dx = −κ x dt + √(2D) dW, which begins in
     equilibrium.  The centre has a flat prior and is integrated out, which gives the density of
     displacements.
 
-    Shapes: `positions` (c, n), `variance` (c, n), `gaps` (n − 1,), `diffusion, stiffness` (m,),
-    result (m,).
+    Shapes: `diffusion, stiffness` (m,), result (m,).
     """
+    positions, variance, gaps, exposure = track
     axes, n = positions.shape
     m = diffusion.size
     wells, state = np.empty((7, m)), np.empty((8, m))
@@ -99,13 +95,7 @@ def harmonic_likelihoods(
 
 @kernel()
 def most_likely_well(
-    positions: FloatArray,
-    variance: FloatArray,
-    gaps: FloatArray,
-    exposure: float,
-    scale: float,
-    softest: float,
-    stiffest: float,
+    track: Track, scale: float, softest: float, stiffest: float
 ) -> tuple[float, float, float]:
     """Maximise the likelihood of a harmonic well over D and stiffness.
 
@@ -114,17 +104,13 @@ def most_likely_well(
     parabola.
     """
     low, high, best = np.empty(2), np.empty(2), np.empty(2)
-    low[0], low[1], high[0], high[1] = (
-        -_LARGEST_LOG_RATIO,
-        math.log(softest),
-        _LARGEST_LOG_RATIO,
-        math.log(stiffest),
-    )
+    low[0], high[0] = -_LARGEST_LOG_RATIO, _LARGEST_LOG_RATIO
+    low[1], high[1] = math.log(softest), math.log(stiffest)
     points, square, vertex = np.empty((2 * _STIFFNESSES, 2)), np.empty((9, 2)), np.empty((1, 2))
     for k in range(2 * _STIFFNESSES):
         points[k, 0] = 0.5 * (k % 2)
         points[k, 1] = low[1] + (high[1] - low[1]) * (k // 2) / (_STIFFNESSES - 1.0)
-    values = _logarithmic(positions, variance, gaps, exposure, scale, points)
+    values = _logarithmic(track, scale, points)
     at = largest(values)
     copy_line(points[at], best)
     value, apart = values[at], _FIRST
@@ -134,7 +120,7 @@ def most_likely_well(
             square[k, 1] += (k % 3 - 1) * apart
             for a in range(2):
                 square[k, a] = min(max(square[k, a], low[a]), high[a])
-        values = _logarithmic(positions, variance, gaps, exposure, scale, square)
+        values = _logarithmic(track, scale, square)
         at = largest(values)
         if values[at] > value:
             copy_line(square[at], best)
@@ -155,7 +141,7 @@ def most_likely_well(
         for a in range(2):
             move = (step0 if a == 0 else step1) * apart / _FINER
             vertex[0, a] = min(max(best[a] + move, low[a]), high[a])
-        there = _logarithmic(positions, variance, gaps, exposure, scale, vertex)[0]
+        there = _logarithmic(track, scale, vertex)[0]
         if there > value:
             copy_line(vertex[0], best)
             value = there
@@ -163,19 +149,10 @@ def most_likely_well(
 
 
 @kernel()
-def _logarithmic(
-    positions: FloatArray,
-    variance: FloatArray,
-    gaps: FloatArray,
-    exposure: float,
-    scale: float,
-    points: FloatArray,
-) -> FloatArray:
+def _logarithmic(track: Track, scale: float, points: FloatArray) -> FloatArray:
     """Log-likelihoods at (log D/scale, log κ)."""
     diffusion, stiffness = np.empty(points.shape[0]), np.empty(points.shape[0])
     for i in range(points.shape[0]):
         diffusion[i], stiffness[i] = scale * math.exp(points[i, 0]), math.exp(points[i, 1])
-    values: FloatArray = harmonic_likelihoods(
-        positions, variance, gaps, exposure, diffusion, stiffness
-    )
+    values: FloatArray = harmonic_likelihoods(track, diffusion, stiffness)
     return values

@@ -22,7 +22,7 @@ from iscat_analysis._kernels import FAST, BoolArray, FloatArray, kernel
 from iscat_analysis._kernels.lattice import BENT, lattice_waves
 from iscat_analysis._kernels.lens import LATTICE, LatticeLens, Lens, Pixels, RoundLens
 from iscat_analysis._kernels.loops import factorise, marked
-from iscat_analysis._kernels.noise import FLOOR, bias_of_pixel, curvature_of_row
+from iscat_analysis._kernels.noise import FLOOR, Measured, bias_of_pixel, curvature_of_row
 from iscat_analysis._kernels.radial import AxialTable, profile_at
 from iscat_analysis._kernels.radial_rows import DISTANCE, evaluate_bends, evaluate_last_slopes
 from iscat_analysis._kernels.scoring import blank_profile, image_score, span
@@ -44,8 +44,8 @@ _NEAR = 1e-6  # of a step: here DF is F″
 
 @kernel()
 def signal_hessian(
-    profile: FloatArray, lens: RoundLens | LatticeLens, pixels: Pixels, x_p: float, y_p: float,
-    amplitude: float, out: FloatArray,
+    profile: FloatArray, lens: RoundLens | LatticeLens, pixels: Pixels, theta: FloatArray,
+    out: FloatArray,
 ) -> None:  # fmt: skip
     """Signal, gradient and second derivatives on a pixel grid, averaged over the samples.
 
@@ -60,8 +60,8 @@ def signal_hessian(
             flat[j] = 0.0
         for i in range(offsets.size):
             for k in range(offsets.size):
-                _place(pixels, first, x_p - offsets[k], y_p - offsets[i], f)
-                _add_derivatives(profile, lens, amplitude, weights[i] * weights[k], f)
+                _place(pixels, first, theta[0] - offsets[k], theta[1] - offsets[i], f)
+                _add_derivatives(profile, lens, theta[3], weights[i] * weights[k], f)
         _copy(f[_SUMS:], cos, sin, first, out)
 
 
@@ -81,12 +81,9 @@ def _place(pixels: Pixels, first: int, x_p: float, y_p: float, f: FloatArray) ->
 
 @kernel()
 def _add_derivatives(
-    profile: FloatArray,
-    lens: RoundLens | LatticeLens,
-    amplitude: float,
-    weight: float,
+    profile: FloatArray, lens: RoundLens | LatticeLens, amplitude: float, weight: float,
     f: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Add weight × signal and derivatives of a strip, one component of the field after another."""
     if len(lens) == LATTICE:
         for c in range(lens.components):
@@ -213,7 +210,7 @@ def derivatives_between(
     profile = blank_profile(axial, lens, 3)
     start, stop = span(lens, pixels, theta, axial.heights.shape[3])
     profile_at(axial, theta[2], start, stop, profile)
-    signal_hessian(profile, lens, pixels, theta[0], theta[1], theta[3], rows)
+    signal_hessian(profile, lens, pixels, theta, rows)
 
 
 @kernel(fastmath=FAST)
@@ -242,26 +239,15 @@ def _products(t: FloatArray, g: FloatArray, sums: FloatArray) -> None:
         f13 += h1 * g3
         f23 += h2 * g3
         f33 += h3 * g3
-    sums[0] += f00
-    sums[1] += f01
-    sums[2] += f11
-    sums[3] += f02
-    sums[4] += f12
-    sums[5] += f22
-    sums[6] += f03
-    sums[7] += f13
-    sums[8] += f23
-    sums[9] += f33
+    for k, value in enumerate((f00, f01, f11, f02, f12, f22, f03, f13, f23, f33)):
+        sums[k] += value
 
 
 @kernel()
-def observed_information(
-    kind: int, data: FloatArray, level: float, rows: FloatArray, out: FloatArray
-) -> None:
-    """Fill `out` (5, 5) with the negative Hessian of the log-likelihood in (x, y, z, a, g)."""
-    t = np.empty((3, rows.shape[2]))
-    sums = np.zeros(14)
-    out[4, 4] = 0.0
+def observed_information(measured: Measured, level: float, rows: FloatArray) -> FloatArray:
+    """Give the negative Hessian (5, 5) of the log-likelihood in (x, y, z, a, g)."""
+    kind, data = measured
+    t, sums, out = np.empty((3, rows.shape[2])), np.zeros(14), np.zeros((5, 5))
     for row in range(rows.shape[0]):
         here = rows[row]
         out[4, 4] -= curvature_of_row(kind, data, row, level, here[0], t)
@@ -276,6 +262,7 @@ def observed_information(
             out[i, j] = out[j, i] = -sums[k]
             k += 1
         out[4, j] = out[j, 4] = -sums[10 + j]
+    return out
 
 
 @kernel()
@@ -348,26 +335,18 @@ def _row_bias(
         b2 += both * per * g[3, j]
         b3 += both * per * g[4, j]
         b4 += both * by_level
-    sums[0] += b0
-    sums[1] += b1
-    sums[2] += b2
-    sums[3] += b3
-    sums[4] += b4
+    for k, value in enumerate((b0, b1, b2, b3, b4)):
+        sums[k] += value
 
 
 @kernel()
 def first_order_bias(
-    kind: int,
-    data: FloatArray,
-    level: float,
-    rows: FloatArray,
-    free: BoolArray,
-    out: FloatArray,
-    height_known: float = 0.0,
-) -> None:
-    """Fill `out` (5) with the bias of order 1/N, NaN where the free parameters are not known."""
-    fisher, inverse, score = np.empty((5, 5)), np.empty((5, 5)), np.empty(5)
-    image_score(kind, data, level, rows, score, fisher)
+    measured: Measured, level: float, rows: FloatArray, free: BoolArray, height_known: float = 0.0
+) -> FloatArray:
+    """Give the bias (5) of order 1/N, NaN where the free parameters are not known."""
+    kind, data = measured
+    fisher, inverse, out = np.empty((5, 5)), np.empty((5, 5)), np.empty(5)
+    image_score(measured, level, rows, (out, fisher))
     fisher[2, 2] += height_known
     invert(fisher, fisher, free, inverse)
     t = np.empty((3, rows.shape[2]))
@@ -378,45 +357,33 @@ def first_order_bias(
         out[i] = 0.0
         for j in range(5):
             out[i] -= 0.5 * inverse[i, j] * sums[j]
+    return out
 
 
 @kernel()
 def errors_and_bias(
-    kind: int,
-    data: FloatArray,
-    level: float,
-    rows: FloatArray,
-    like: FloatArray,
-    free: BoolArray,
-    moving: BoolArray,
-    slope: float,
-    height_known: float,
-    sigma: FloatArray,
-    covariance: FloatArray,
-    bias: FloatArray,
-) -> bool:
-    """Fill errors, covariance and bias of a fit, from the likelihood and a prior of z.
+    measured: Measured, level: float, rows: FloatArray, like: FloatArray,
+    free: tuple[BoolArray, BoolArray], units: tuple[float, float],
+) -> tuple[bool, FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Errors (4), covariance (n, n) and bias (5) of a fit, and whether they are known.
 
-    Shapes: `like` (5, 5), `free, moving` (5,), `sigma` (4,), `covariance` (n, n), `bias` (5,).
+    `like` (5, 5) is about the information, `free` has the parameters that were fitted, and those of
+    them that noise moves, `units` the unit of the fourth one and the information of a prior of z.
     """
-    information, inverse = np.empty((5, 5)), np.empty((5, 5))
-    observed_information(kind, data, level, rows, information)
+    fitted, moving = free
+    slope, height_known = units
+    inverse, index = np.empty((5, 5)), marked(fitted[:4])
+    information = observed_information(measured, level, rows)
     information[2, 2] += height_known
-    known: bool = invert(information, like, free, inverse)
-    n = 0
-    for i in range(4):
-        sigma[i] = np.nan
-        if free[i]:
-            m = 0
-            for j in range(4):
-                if free[j]:
-                    unit = (slope if i == 3 else 1.0) * (slope if j == 3 else 1.0)
-                    covariance[n, m] = inverse[i, j] * unit
-                    m += 1
-            sigma[i] = np.sqrt(covariance[n, n])
-            n += 1
+    known: bool = invert(information, like, fitted, inverse)
+    sigma, covariance = np.full(4, np.nan), np.empty((index.size, index.size))
+    for n in range(index.size):
+        for m in range(index.size):
+            i, j = index[n], index[m]
+            unit = (slope if i == 3 else 1.0) * (slope if j == 3 else 1.0)
+            covariance[n, m] = inverse[i, j] * unit
+        sigma[index[n]] = np.sqrt(covariance[n, n])
+    bias = np.full(5, np.nan)
     if known:
-        first_order_bias(kind, data, level, rows, moving, bias, height_known)
-    else:
-        bias[:] = np.nan
-    return known
+        bias = first_order_bias(measured, level, rows, moving, height_known)
+    return known, sigma, covariance, bias

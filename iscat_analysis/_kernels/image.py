@@ -1,4 +1,4 @@
-"""From a radial profile to the image of a particle and its gradient, a row of pixels at a time.
+"""From a profile to the image of a particle and its gradient, a strip of rows at a time.
 
 The *signal* is the detected intensity above the reference's, over the reference's (contrast), or in
 dark field, where `rho` = 0 instead of 1, the intensity itself:
@@ -6,87 +6,120 @@ dark field, where `rho` = 0 instead of 1, the intensity itself:
     s = 2ρ a Re e_u + a² (|e_u|² + |e_v|²),
 
 with a the amplitude and e the field per unit amplitude.  Positions are nm; (x, y) camera axes,
-(u, v) the frame of the polarisation, rotated by ψ.  Derivatives are with respect to the particle's
-(x, y, z, a).
+(u, v) the frame of the polarisation, rotated by ψ.  θ = (x, y, z, a, …) are the parameters of a
+particle, and derivatives are with respect to its (x, y, z, a).
 
-`radial_rows`, `lattice_rows` and `stamp` compute an image from a profile.
+`radial_rows`, `lattice` and `stamp` compute the strips of the three kinds of lenses.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from iscat_analysis._kernels import FloatArray, kernel
-from iscat_analysis._kernels.lattice import interpolate_columns, lattice_row, rows_needed
-from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, LatticeLens, Lens, Pixels
-from iscat_analysis._kernels.radial_rows import radial_gradient, radial_parts, radial_signal
-from iscat_analysis._kernels.stamp import stamp_gradient, stamp_signal
+from iscat_analysis._kernels.lattice import TAPS, interpolate_columns, lattice_row
+from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, LatticeLens, Lens, Pixels, RoundLens
+from iscat_analysis._kernels.radial_rows import (
+    SUMS,
+    radial_parts,
+    radial_signal,
+    radial_strip,
+    strip_scratch,
+)
+from iscat_analysis._kernels.stamp import STRIP, add_stamp, begin_stamp, stamp_strip
 
 
 @kernel()
-def _begin_lattice(
-    profile: FloatArray, lens: LatticeLens, pixels: Pixels, x_p: float, y_p: float,
-    with_gradient: bool,
-) -> FloatArray:  # fmt: skip
-    """Interpolate the columns of an image on a lattice."""
-    f = np.empty((rows_needed(lens, pixels), pixels.x.size))
-    interpolate_columns(profile, lens, pixels, x_p, y_p, with_gradient, f)
-    return f
-
-
-@kernel()
-def signal_parts(
-    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, unit: float,
-    out: FloatArray,
-) -> None:  # fmt: skip
-    """Fill `out` (2, ny·nx) with P and Q of the signal a P + a² Q.
-
-    At the amplitude `unit` neither is lost in the rounding of the other.  Not for samples at one
-    height, which are P and Q themselves.
-    """
+def begin_strips(
+    profile: FloatArray, lens: Lens, pixels: Pixels, theta: FloatArray
+) -> tuple[int, Any, FloatArray]:
+    """Rows of pixels in a strip, work space, and the lines (5, pixels) that a strip fills."""
+    columns = pixels.x.size
     if len(lens) == ROUND:
-        radial_parts(profile, lens, pixels, x_p, y_p, out)
-        return
-    f, nx = _begin_lattice(profile, lens, pixels, x_p, y_p, False), pixels.x.size
-    for row in range(pixels.y.size):
-        p, q = out[0, row * nx : (row + 1) * nx], out[1, row * nx : (row + 1) * nx]
-        lattice_row(lens, pixels, row, y_p, unit, f, p.reshape(1, nx))
-        lattice_row(lens, pixels, row, y_p, -unit, f, q.reshape(1, nx))
-        for j in range(p.size):
-            up, down = p[j], q[j]
-            p[j], q[j] = (up - down) / (2 * unit), (up + down) / (2 * unit * unit)
+        together, f = strip_scratch(pixels)
+        return together, f, f[SUMS : SUMS + 5]
+    if len(lens) == STAMP:
+        at, lines = np.empty(TAPS, dtype=np.int64), np.zeros((5, STRIP * columns))
+        return int(np.int64(STRIP)), (begin_stamp(profile, lens, pixels, theta), at), lines
+    width = 2 * lens.components
+    work = interpolate_columns(profile, lens, pixels, theta, 2 * width, width)
+    return int(np.int64(1)), work, np.empty((5, columns))
 
 
 @kernel()
-def signal_image(
-    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
-    out: FloatArray,
+def fill_strip(
+    profile: FloatArray, lens: Lens, pixels: Pixels, theta: FloatArray, first: int, last: int,
+    begun: tuple[int, Any, FloatArray],
 ) -> None:  # fmt: skip
-    """Fill `out` (ny, nx) with the signal on a pixel grid; the rest as in `signal_gradient`."""
-    if len(lens) == STAMP:
-        stamp_signal(profile, lens, pixels, x_p, y_p, amplitude, out)
-    elif len(lens) == LATTICE:
-        f = _begin_lattice(profile, lens, pixels, x_p, y_p, False)
-        for row in range(pixels.y.size):
-            lattice_row(lens, pixels, row, y_p, amplitude, f, out[row : row + 1])
+    """Fill the lines from `begin_strips` with signal and gradient of rows `first` to `last`.
+
+    All pixels of the rows follow one another.
+    """
+    _, work, lines = begun
+    if len(lens) == ROUND:
+        radial_strip(profile, lens, pixels, theta, first, last, 5, work)
+    elif len(lens) == STAMP:
+        stamp_strip(profile, lens, first, last - first, pixels.x.size, work, lines)
     else:
-        radial_signal(profile, lens, pixels, x_p, y_p, amplitude, out)
+        lattice_row(lens, pixels, first, theta, work, lines)
 
 
 @kernel()
 def signal_gradient(
-    profile: FloatArray, lens: Lens, pixels: Pixels, x_p: float, y_p: float, amplitude: float,
+    profile: FloatArray, lens: Lens, pixels: Pixels, theta: FloatArray, out: FloatArray
+) -> None:
+    """Fill `out` (ny, 5, nx) with signal and gradient on a pixel grid."""
+    begun = begin_strips(profile, lens, pixels, theta)
+    together, _, lines = begun
+    rows, columns = pixels.y.size, pixels.x.size
+    for first in range(0, rows, together):
+        last = min(first + together, rows)
+        fill_strip(profile, lens, pixels, theta, first, last, begun)
+        for row in range(first, last):
+            for k in range(5):
+                here, there = lines[k, (row - first) * columns :], out[row, k]
+                for j in range(columns):
+                    there[j] = here[j]
+
+
+@kernel()
+def signal_image(
+    profile: FloatArray, lens: Lens, pixels: Pixels, theta: FloatArray, out: FloatArray
+) -> None:
+    """Fill `out` (ny, nx) with the signal on a pixel grid; the rest as in `signal_gradient`."""
+    if len(lens) == STAMP:
+        out[:] = 0.0
+        add_stamp(profile, lens, pixels, theta, 1.0, out)
+    elif len(lens) == LATTICE:
+        f = interpolate_columns(profile, lens, pixels, theta, 2 * lens.components, 0)
+        for row in range(pixels.y.size):
+            lattice_row(lens, pixels, row, theta, f, out[row : row + 1])
+    else:
+        radial_signal(profile, lens, pixels, theta, out)
+
+
+@kernel()
+def signal_parts(
+    profile: FloatArray, lens: RoundLens | LatticeLens, pixels: Pixels, theta: FloatArray,
     out: FloatArray,
 ) -> None:  # fmt: skip
-    """Signal and gradient on a pixel grid.
+    """Fill `out` (2, ny·nx) with P and Q of the signal a P + a² Q.
 
-    Shapes: `out` (ny, 5, nx).
+    At the amplitude of θ neither is lost in the rounding of the other.  Not for samples at one
+    height, which are P and Q themselves.
     """
-    if len(lens) == STAMP:
-        stamp_gradient(profile, lens, pixels, x_p, y_p, amplitude, out)
-    elif len(lens) == LATTICE:
-        f = _begin_lattice(profile, lens, pixels, x_p, y_p, True)
-        for row in range(pixels.y.size):
-            lattice_row(lens, pixels, row, y_p, amplitude, f, out[row])
-    else:
-        radial_gradient(profile, lens, pixels, x_p, y_p, amplitude, out)
+    if len(lens) == ROUND:
+        radial_parts(profile, lens, pixels, theta, out)
+        return
+    against, unit, columns = theta.copy(), theta[3], pixels.x.size
+    against[3] = -unit
+    f = interpolate_columns(profile, lens, pixels, theta, 2 * lens.components, 0)
+    for row in range(pixels.y.size):
+        p, q = out[0, row * columns :][:columns], out[1, row * columns :][:columns]
+        lattice_row(lens, pixels, row, theta, f, p.reshape(1, columns))
+        lattice_row(lens, pixels, row, against, f, q.reshape(1, columns))
+        for j in range(columns):
+            up, down = p[j], q[j]
+            p[j], q[j] = (up - down) / (2 * unit), (up + down) / (2 * unit * unit)

@@ -32,7 +32,7 @@ from scipy.special import i0, j0, j1
 
 from iscat_analysis._kernels import FAST, AnyFloatArray, ComplexArray, FloatArray, IntArray, kernel
 from iscat_analysis._kernels.lens import LatticeLens, Pixels
-from iscat_analysis._kernels.loops import mix, mix_both, within
+from iscat_analysis._kernels.loops import lines_apart, mix, mix_both, within
 from iscat_analysis._kernels.radial import fill_quintics
 
 LATTICE_STEP = 1.2
@@ -365,43 +365,6 @@ def node_rows(lens: LatticeLens, pixels: Pixels, y_p: float) -> tuple[int, int]:
 
 
 @kernel()
-def rows_needed(lens: LatticeLens, pixels: Pixels) -> int:
-    """Rows of work space that an image needs, wherever the particle is."""
-    low, high = _ends(pixels.y)
-    span = high - low + 2 * abs(pixels.offsets[-1])
-    rows = int(span * lens.inv_step) + TAPS + 2
-    return FIELDS + pixels.offsets.size * 6 * lens.components * rows
-
-
-@kernel(fastmath=FAST, _nrt=False)
-def _blend(nodes: FloatArray, row: int, first: int, w: FloatArray, out: FloatArray) -> None:
-    """Fill `out` (n) with the combination w of TAPS rows of `nodes`, n columns from the first."""
-    last = first + out.size
-    for k in range(0, TAPS, 4):
-        a, b = nodes[row + k, first:last], nodes[row + k + 1, first:last]
-        c, d = nodes[row + k + 2, first:last], nodes[row + k + 3, first:last]
-        mix(a, b, c, d, w, k, out)
-
-
-@kernel(fastmath=FAST, _nrt=False)
-def _blend_both(
-    nodes: FloatArray,
-    row: int,
-    first: int,
-    w: FloatArray,
-    v: FloatArray,
-    out: FloatArray,
-    other: FloatArray,
-) -> None:
-    """Fill `out` and `other` with two combinations of the same rows; see `_blend`."""
-    last = first + out.size
-    for k in range(0, TAPS, 4):
-        a, b = nodes[row + k, first:last], nodes[row + k + 1, first:last]
-        c, d = nodes[row + k + 2, first:last], nodes[row + k + 3, first:last]
-        mix_both(a, b, c, d, w, v, k, out, other)
-
-
-@kernel()
 def _locate(lens: LatticeLens, away: float, w: FloatArray) -> int:
     """Fill the weights of the nodes at a distance from the particle; give the first of them."""
     place = _node(lens, away)
@@ -420,10 +383,13 @@ def _columns(
     written once.
     """
     rows, columns = out.shape
+    side = plane.shape[1]
+    nodes, at = plane.reshape(plane.size), lines_apart(side, TAPS)
     for start in range(0, columns, STRIP):
         count = min(STRIP, columns - start)
         for j in range(count):
-            _blend(plane, left[start + j], first, weights[start + j], strip[j])
+            begin = left[start + j] * side + first
+            mix(nodes[begin:], at, weights[start + j], strip[j])
         for r in range(rows):
             for j in range(count):
                 out[r, start + j] = strip[j, r]
@@ -431,26 +397,27 @@ def _columns(
 
 @kernel()
 def interpolate_columns(
-    profile: FloatArray, lens: LatticeLens, pixels: Pixels, x_p: float, y_p: float,
-    with_gradient: bool, f: FloatArray,
-) -> None:  # fmt: skip
-    """Interpolate along x: fields and slopes at every column of pixels and row of nodes."""
-    first, rows = node_rows(lens, pixels, y_p)
-    columns = pixels.x.size
+    profile: FloatArray, lens: LatticeLens, pixels: Pixels, theta: FloatArray, values: int,
+    slopes: int,
+) -> FloatArray:  # fmt: skip
+    """Interpolate the first channels along x, and slopes of the first ones along it.
+
+    Shapes: result (rows, nx): after `FIELDS` rows, for each sample along x, each channel at each
+    row of nodes.
+    """
+    first, rows = node_rows(lens, pixels, theta[1])
+    columns, samples, here = pixels.x.size, pixels.offsets.size, FIELDS
+    f = np.empty((FIELDS + samples * (values + slopes) * rows, columns))
     w, left = np.empty((2, columns, TAPS)), np.empty(columns, dtype=np.int64)
     strip = np.empty((STRIP, rows))
-    width = 2 * lens.components
-    here = FIELDS
-    for sample in range(pixels.offsets.size):
+    for sample in range(samples):
         for j in range(columns):
-            left[j] = _locate(lens, pixels.x[j] + pixels.offsets[sample] - x_p, w[:, j])
-        for k in range(2 * width if with_gradient else width):
-            _columns(profile[k], left, w[0], first, strip, f[here : here + rows])
+            left[j] = _locate(lens, pixels.x[j] + pixels.offsets[sample] - theta[0], w[:, j])
+        for k in range(values + slopes):
+            channel, order = (k, 0) if k < values else (k - values, 1)
+            _columns(profile[channel], left, w[order], first, strip, f[here : here + rows])
             here += rows
-        if with_gradient:
-            for k in range(width):
-                _columns(profile[k], left, w[1], first, strip, f[here : here + rows])
-                here += rows
+    return f
 
 
 @kernel(fastmath=FAST)
@@ -486,35 +453,34 @@ def _add_signal(
 
 @kernel(forceinline=True)
 def lattice_row(
-    lens: LatticeLens, pixels: Pixels, row: int, y_p: float, amplitude: float, f: FloatArray,
-    out: FloatArray,
-) -> None:  # fmt: skip
+    lens: LatticeLens, pixels: Pixels, row: int, theta: FloatArray, f: FloatArray, out: FloatArray
+) -> None:
     """Fill `out` with signal and gradient (5, nx) of one row, or its signal alone (1, nx)."""
-    first, rows = node_rows(lens, pixels, y_p)
+    first, rows = node_rows(lens, pixels, theta[1])
     gradient, w = len(out) > 1, np.empty((2, TAPS))
-    width, q = 2 * lens.components, pixels.offsets.size
+    width, q, columns = 2 * lens.components, pixels.offsets.size, out.shape[1]
+    nodes, at = f.reshape(f.size), lines_apart(columns, TAPS)
+    apart = width * rows * columns
     out[:] = 0.0
     for i in range(q):
-        top = _locate(lens, pixels.y[row] + pixels.offsets[i] - y_p, w) - first
+        top = _locate(lens, pixels.y[row] + pixels.offsets[i] - theta[1], w) - first
         for sample in range(q):
-            start = FIELDS + sample * (3 if gradient else 1) * width * rows + top
+            start = (FIELDS + sample * (3 if gradient else 1) * width * rows + top) * columns
             for k in range(width):
-                here = start + k * rows
+                here = start + k * rows * columns
                 if not gradient:
-                    _blend(f, here, 0, w[0], f[k])
+                    mix(nodes[here:], at, w[0], f[k])
                     continue
-                _blend_both(f, here, 0, w[0], w[1], f[k], f[3 * MOST + k])
-                here += width * rows
-                _blend(f, here, 0, w[0], f[MOST + k])
-                here += width * rows
-                _blend(f, here, 0, w[0], f[2 * MOST + k])
+                mix_both(nodes[here:], at, w, f[k], f[3 * MOST + k])
+                mix(nodes[here + apart :], at, w[0], f[MOST + k])
+                mix(nodes[here + 2 * apart :], at, w[0], f[2 * MOST + k])
             weight = pixels.weights[i] * pixels.weights[sample]
             for c in range(lens.components):
                 rho = lens.rho if c == 0 else 0.0
                 if gradient:
-                    _add_gradient(rho, amplitude, weight, f, 2 * c, out)
+                    _add_gradient(rho, theta[3], weight, f, 2 * c, out)
                 else:
-                    _add_signal(rho, amplitude, weight, f[2 * c], f[2 * c + 1], out[0])
+                    _add_signal(rho, theta[3], weight, f[2 * c], f[2 * c + 1], out[0])
 
 
 @kernel(fastmath=FAST)
@@ -529,41 +495,31 @@ def _add_product(
 
 @kernel()
 def lattice_values(
-    stack: FloatArray,
-    lens: LatticeLens,
-    pixels: Pixels,
-    x_p: float,
-    y_p: float,
-    amplitude: float,
-    components: int,
+    stack: FloatArray, lens: LatticeLens, pixels: Pixels, theta: FloatArray, components: int,
     out: FloatArray,
-) -> None:
+) -> None:  # fmt: skip
     """Signal of a field and its derivatives along changes of that field.
 
     Shapes: `stack` (k·components·2, nodes, nodes), `out` (k, ny, nx).
     """
-    first, rows = node_rows(lens, pixels, y_p)
-    columns, channels, a = pixels.x.size, stack.shape[0], amplitude
-    w, left = np.empty((1, columns, TAPS)), np.empty(columns, dtype=np.int64)
-    strip, f = np.empty((STRIP, rows)), np.empty((channels, columns))
-    across = np.empty((channels, rows, columns))
+    first, rows = node_rows(lens, pixels, theta[1])
+    columns, channels, a = pixels.x.size, stack.shape[0], theta[3]
+    across = interpolate_columns(stack, lens, pixels, theta, channels, 0)
+    nodes, at = across.reshape(across.size), lines_apart(columns, TAPS)
+    w, f = np.empty((1, TAPS)), np.empty((channels, columns))
     out[:] = 0.0
-    for sample in range(pixels.offsets.size):
-        for j in range(columns):
-            left[j] = _locate(lens, pixels.x[j] + pixels.offsets[sample] - x_p, w[:, j])
-        for k in range(channels):
-            _columns(stack[k], left, w[0], first, strip, across[k])
-        for row in range(pixels.y.size):
-            for i in range(pixels.offsets.size):
-                away = pixels.y[row] + pixels.offsets[i] - y_p
-                top = _locate(lens, away, w[:, 0]) - first
+    for row in range(pixels.y.size):
+        for i in range(pixels.offsets.size):
+            top = _locate(lens, pixels.y[row] + pixels.offsets[i] - theta[1], w) - first
+            for sample in range(pixels.offsets.size):
                 for k in range(channels):
-                    _blend(across[k], top, 0, w[0, 0], f[k])
+                    start = FIELDS + (sample * channels + k) * rows + top
+                    mix(nodes[start * columns :], at, w[0], f[k])
                 weight = pixels.weights[i] * pixels.weights[sample]
                 for c in range(components):
                     rho = lens.rho if c == 0 else 0.0
                     _add_signal(rho, a, weight, f[2 * c], f[2 * c + 1], out[0, row])
-                    for j in range(f.shape[1]):
+                    for j in range(columns):
                         f[2 * c, j] *= a
                         f[2 * c + 1, j] *= a
                     for k in range(1, out.shape[0]):

@@ -12,6 +12,9 @@ from numba import njit
 
 from iscat_analysis._kernels import FAST, FloatArray, kernel
 
+Species = tuple[FloatArray, FloatArray, FloatArray]
+"""Weights, means μ and variances τ² of species (k,)."""
+
 _LOG_2PI = math.log(2.0 * math.pi)
 _CERTAIN_SIGMAS = 9.0  # standard deviations above the threshold: the probability is 1
 _TINY = 1e-250  # smaller densities are added by their logarithms
@@ -47,20 +50,15 @@ def _exp_falling(x: float) -> float:
 
 @kernel(fastmath=FAST, _nrt=False)
 def _densities(
-    x: FloatArray,
-    noise: FloatArray,
-    weight: float,
-    mean: float,
-    variance: float,
-    share: FloatArray,
-    slope: FloatArray,
-    inverse: FloatArray,
+    x: FloatArray, noise: FloatArray, one: tuple[float, float, float], terms: FloatArray,
     norm: FloatArray,
-) -> None:
-    """Fill √(2π) times the density of a species at some events, and add it to `norm`.
+) -> None:  # fmt: skip
+    """Add √(2π) times the density of a species, (weight, μ, τ²), at some events to `norm`.
 
-    `slope` and `inverse` become (x − μ)/(τ² + σ²) and 1/(τ² + σ²).
+    Fills terms (3, n): that density, (x − μ)/(τ² + σ²) and 1/(τ² + σ²).
     """
+    weight, mean, variance = one
+    share, slope, inverse = terms[0], terms[1], terms[2]
     for i in range(x.size):
         over = 1.0 / (variance + noise[i])
         d = x[i] - mean
@@ -70,9 +68,7 @@ def _densities(
 
 
 @kernel()
-def _by_logarithms(
-    weight: FloatArray, share: FloatArray, slope: FloatArray, inverse: FloatArray, norm: FloatArray
-) -> float:
+def _by_logarithms(weight: FloatArray, terms: FloatArray, norm: FloatArray) -> float:
     """Compute events far from every species again; return the change of their logarithms."""
     added = 0.0
     for i in range(norm.size):
@@ -80,34 +76,28 @@ def _by_logarithms(
             continue
         top = -1e300
         for j in range(weight.size):
-            share[j, i] = math.log(weight[j] + 1e-300) + 0.5 * math.log(inverse[j, i])
-            share[j, i] -= 0.5 * slope[j, i] * slope[j, i] / inverse[j, i]
-            top = max(top, share[j, i])
+            share, slope, inverse = terms[j, :, i]
+            share = math.log(weight[j] + 1e-300) + 0.5 * (math.log(inverse) - slope**2 / inverse)
+            terms[j, 0, i] = share
+            top = max(top, share)
         norm[i] = 0.0
         for j in range(weight.size):
-            share[j, i] = math.exp(share[j, i] - top)
-            norm[i] += share[j, i]
+            terms[j, 0, i] = math.exp(terms[j, 0, i] - top)
+            norm[i] += terms[j, 0, i]
         added += top
     return added
 
 
 @kernel()
 def _expect(
-    x: FloatArray,
-    noise: FloatArray,
-    weight: FloatArray,
-    mean: FloatArray,
-    variance: FloatArray,
-    share: FloatArray,
-    slope: FloatArray,
-    inverse: FloatArray,
-    norm: FloatArray,
+    x: FloatArray, noise: FloatArray, species: Species, terms: FloatArray, norm: FloatArray
 ) -> float:
     """Fill the shares of each event and the reciprocal norms; return Σ log(√(2π) density)."""
+    weight, mean, variance = species
     norm[:] = 0.0
     for j in range(weight.size):
-        _densities(x, noise, weight[j], mean[j], variance[j], share[j], slope[j], inverse[j], norm)
-    value: float = _by_logarithms(weight, share, slope, inverse, norm)
+        _densities(x, noise, (weight[j], mean[j], variance[j]), terms[j], norm)
+    value: float = _by_logarithms(weight, terms, norm)
     for i in range(norm.size):
         value += math.log(norm[i])
         norm[i] = 1.0 / norm[i]
@@ -116,10 +106,11 @@ def _expect(
 
 @kernel(fastmath=FAST, _nrt=False)
 def _moments(
-    share: FloatArray, over: FloatArray, slope: FloatArray, inverse: FloatArray, noise: FloatArray
+    terms: FloatArray, over: FloatArray, noise: FloatArray
 ) -> tuple[float, float, float, float, float]:
     """Sum the shares r of a species, r·slope, r·slope², r·inverse and r·inverse·σ²."""
     size = first = second = spread = noisy = 0.0
+    share, slope, inverse = terms[0], terms[1], terms[2]
     for i in range(over.size):
         r = share[i] * over[i]
         size += r
@@ -131,42 +122,34 @@ def _moments(
 
 
 @kernel()
-def mixture_sums(
-    x: FloatArray, noise: FloatArray, weight: FloatArray, mean: FloatArray, variance: FloatArray
-) -> tuple[float, FloatArray]:
+def mixture_sums(x: FloatArray, noise: FloatArray, species: Species) -> tuple[float, FloatArray]:
     """Sum over events the terms from which EM steps and slopes are computed.
 
-    Shapes: `x, noise` (n,), `weight, mean, variance` (k,), `sums` (k, 5).
+    Shapes: `x, noise` (n,), `sums` (k, 5).
     """
-    n, k = x.size, weight.size
-    sums = np.zeros((k, 5))
-    share, slope, inverse = np.empty((k, _BLOCK)), np.empty((k, _BLOCK)), np.empty((k, _BLOCK))
-    norm = np.empty(_BLOCK)
+    n, k = x.size, species[0].size
+    sums, terms, norm = np.zeros((k, 5)), np.empty((k, 3, _BLOCK)), np.empty(_BLOCK)
     value = -0.5 * n * _LOG_2PI
     for start in range(0, n, _BLOCK):
         stop = min(start + _BLOCK, n)
         here = norm[: stop - start]
-        value += _expect(
-            x[start:stop], noise[start:stop], weight, mean, variance, share, slope, inverse, here
-        )
+        value += _expect(x[start:stop], noise[start:stop], species, terms, here)
         for j in range(k):
-            found = _moments(share[j], here, slope[j], inverse[j], noise[start:stop])
+            found = _moments(terms[j], here, noise[start:stop])
             for m in range(5):
                 sums[j, m] += found[m]
     return value, sums
 
 
 @kernel()
-def mixture_score(
-    x: FloatArray, noise: FloatArray, weight: FloatArray, mean: FloatArray, variance: FloatArray
-) -> tuple[float, FloatArray]:
+def mixture_score(x: FloatArray, noise: FloatArray, species: Species) -> tuple[float, FloatArray]:
     """Log-likelihood and its gradient.
 
-    Shapes: `x, noise` (n,), `weight, mean, variance` (k,), `gradient` (3, k).
+    Shapes: `x, noise` (n,), `gradient` (3, k).
     """
-    value, sums = mixture_sums(x, noise, weight, mean, variance)
-    gradient = np.empty((3, weight.size))
-    for j in range(weight.size):
+    value, sums = mixture_sums(x, noise, species)
+    gradient = np.empty((3, sums.shape[0]))
+    for j in range(sums.shape[0]):
         gradient[0, j] = sums[j, 0]
         gradient[1, j] = sums[j, 1]
         gradient[2, j] = 0.5 * (sums[j, 2] - sums[j, 3])
@@ -185,17 +168,13 @@ def _log_normal_cdf(a: float) -> float:
 
 @kernel()
 def detection_score(
-    noise: FloatArray,
-    threshold: float,
-    times: int,
-    weight: FloatArray,
-    mean: FloatArray,
-    variance: FloatArray,
+    noise: FloatArray, threshold: float, times: int, species: Species
 ) -> tuple[float, FloatArray]:
     """Logarithm of the probability to detect the events, and its gradient.
 
-    Shapes: `noise` (n,), `weight, mean, variance` (k,), `gradient` (3, k).
+    Shapes: `noise` (n,), `gradient` (3, k).
     """
+    weight, mean, variance = species
     n, k = noise.size, weight.size
     gradient = np.zeros((3, k))
     at, reach, part, edge = np.empty(k), np.empty(k), np.empty(k), np.empty(k)

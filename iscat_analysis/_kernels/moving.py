@@ -8,7 +8,7 @@ with the others in its background, so that the result does not depend on the dis
 over threads.
 
 `place_score` gives score, information and likelihood of a particle in one pass over its square, as
-`image_score` and `image_value` of `iscat_analysis._kernels.scoring` do for a POISSON image at level
+`image_score` of `iscat_analysis._kernels.scoring` does for a POISSON image at level
 1, without the parameters that a fit of a frame does not need: the level and, for an image at one
 height, z.  All three share the expected counts and one division per pixel.  For n counts, of which
 b are expected without the particle and δ more with it, and w = δ/(2b + δ), the log-likelihood
@@ -37,20 +37,14 @@ from iscat_analysis._kernels.canvas import (
     Pictures,
     Rows,
     cut,
-    draw_gradient,
+    draw,
     square_of,
     stage,
 )
 from iscat_analysis._kernels.lens import STAMP, Lens, Pixels
 from iscat_analysis._kernels.loops import copy_line
 from iscat_analysis._kernels.noise import FLOOR, POISSON, SERIES, twice_artanh
-from iscat_analysis._kernels.scoring import (
-    CONVERGED,
-    STALLED,
-    image_score,
-    image_value,
-    scoring_step,
-)
+from iscat_analysis._kernels.scoring import CONVERGED, STALLED, image_score, scoring_step
 
 LEAST = 1e-15
 """Smallest expected count, like `FLOOR` of `noise`; its square is above 0 in single precision."""
@@ -62,14 +56,13 @@ def place_score(
 ) -> float:
     """Fill score and Fisher matrix of (x, y, z, a), and give the log-likelihood.
 
-    Shapes: `data` (4, ny, nx), `here` (ny, 5, nx), `score, fisher` (5,).
+    Shapes: `data` (4, ny, nx), `here` (ny, 5, nx), `score` (5,), `fisher` (5, 5).
     """
     if len(lens) != STAMP:
-        image_score(np.int64(POISSON), data, 1.0, here, score, fisher)
+        value: float = image_score((np.int64(POISSON), data), 1.0, here, (score, fisher))
         score[4] = 0.0
         for i in range(5):
             fisher[i, 4] = fisher[4, i] = 0.0
-        value: float = image_value(np.int64(POISSON), data, 1.0, here)
         return value
     value, beyond = _flat_score(data, here, score, fisher)
     if beyond:
@@ -173,19 +166,39 @@ class Room(NamedTuple):
     work: FloatArray
 
 
+class Scene(NamedTuple):
+    """What the kernels of rows are given of the frames, of all particles in them, and to work."""
+
+    light: Light
+    field: Field
+    near: Pictures
+    canvas: Canvas
+    slopes: Slopes
+    room: Room
+
+
+class Totals(NamedTuple):
+    """Background (y, x), Σ B C of each frame (t,), and Σ w C over frames (y, x)."""
+
+    background: NDArray[np.float32]
+    expected: FloatArray
+    sums: NDArray[np.float32]
+
+
 @kernel(_nrt=False)
 def fit_frames(
-    light: Light, field: Field, near: Pictures, search: Search, particles: Rows, last: int,
-    sweeps: int, canvas: Canvas, slopes: Slopes, fits: Fits, expected: FloatArray,
-    background: NDArray[np.float32], sums: NDArray[np.float32], place: IntArray, room: Room,
+    scene: Scene, search: Search, particles: Rows, frames: tuple[int, int], fits: Fits,
+    totals: Totals, place: IntArray,
 ) -> bool:  # fmt: skip
-    """Fit the rows of frames up to last − 1, each `sweeps` times, with plain scoring steps.
+    """Fit the rows of frames up to the first number − 1, each as often as the second one says.
 
-    If plain steps fail for a row, the kernel returns its position, its constants and a start inside
-    its box.  The caller puts its maximum into `particles` and `fits`, and calls again.
-
-    Shapes: `expected` (t,), `background` (y, x), `sums` (y, x), `place` (7,).
+    If plain scoring steps fail for a row, the kernel returns its position, its constants and a
+    start inside its box, in `place` (7,).  The caller puts its maximum into `particles` and `fits`,
+    and calls again.
     """
+    light, field, near, canvas, slopes, room = scene
+    background, expected, sums = totals
+    last, sweeps = frames
     starts, theta, group = particles
     outcome, information, gain = fits
     rows, columns = light.background.shape
@@ -196,9 +209,7 @@ def fit_frames(
         t = place[0]
         total = canvas.total[t]
         if sweeps and place[4] == 0:
-            expected[t] = _read_ahead(
-                light.counts[t]
-            )  # stored, or the compiler would drop the loop
+            expected[t] = _read_ahead(light.counts[t])  # stored, or the loop would be dropped
         while place[1] < sweeps:
             for r in range(place[2], starts[t + 1]):
                 p, helped = theta[r], place[4] > 0
@@ -211,7 +222,7 @@ def fit_frames(
                 ny, nx = r1 - r0, c1 - c0
                 pixels = cut(field.pixels, r0, r1, c0, c1)
                 both = room.pixels[5 * area : 5 * area + 10 * ny * nx].reshape(2, ny, 5, nx)
-                draw_gradient(near, group[r], p, pixels, room.profile, both[0])
+                draw(near, group[r], p, pixels, room.profile, both[0])
                 data = room.pixels[: 4 * ny * nx].reshape(4, ny, nx)
                 signal = room.pixels[4 * area : 4 * area + ny * nx].reshape(ny, nx)
                 if not helped:
@@ -286,7 +297,7 @@ def _climb(
         if gain < search.tolerance:
             copy_line(trial, p)
             return CONVERGED, at, value + gain
-        draw_gradient(near, group, trial, pixels, room.profile, both[1 - at])
+        draw(near, group, trial, pixels, room.profile, both[1 - at])
         there = place_score(data, both[1 - at], near.lens, score, fisher)
         if not there > value:
             break

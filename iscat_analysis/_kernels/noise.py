@@ -25,6 +25,9 @@ from iscat_analysis._kernels import FAST, FloatArray, kernel
 
 CONDITIONAL, POISSON = 0, 1
 
+Measured = tuple[int, FloatArray]
+"""The number of a noise model, and its data."""
+
 SERIES = 0.2
 """Largest |x| for which ln(1+x) is computed from its series."""
 

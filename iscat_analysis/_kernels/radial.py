@@ -284,9 +284,3 @@ def profile_at(axial: AxialTable, z_nm: float, start: int, stop: int, profile: F
                 _lattice_2(near, profile, begin + min(j, last), factors)
             else:
                 _lattice_3(near, profile, begin + min(j, last), factors)
-
-
-@kernel()
-def profile_between(axial: AxialTable, z_nm: float, profile: FloatArray) -> None:
-    """Fill a whole profile of one order or more by interpolation along z."""
-    profile_at(axial, z_nm, np.int64(0), axial.heights.shape[3], profile)

@@ -18,14 +18,13 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis._kernels import FAST, BoolArray, FloatArray, kernel
-from iscat_analysis._kernels.image import signal_gradient, signal_image, signal_parts
-from iscat_analysis._kernels.lattice import TAPS, lattice_span
-from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, Lens, Pixels, named_lens
-from iscat_analysis._kernels.loops import factorise, solve
-from iscat_analysis._kernels.noise import score_of_pixel, value_of_pixels
+from iscat_analysis._kernels.image import begin_strips, fill_strip, signal_image, signal_parts
+from iscat_analysis._kernels.lattice import lattice_span
+from iscat_analysis._kernels.lens import LATTICE, STAMP, Lens, Pixels, named_lens
+from iscat_analysis._kernels.loops import copy_line, factorise, marked, solve
+from iscat_analysis._kernels.noise import Measured, score_of_pixel, value_of_pixels
 from iscat_analysis._kernels.radial import POWERS, AxialTable, profile_at
-from iscat_analysis._kernels.radial_rows import intervals_needed, radial_strip, strip_scratch
-from iscat_analysis._kernels.stamp import STRIP, begin_stamp, stamp_strip
+from iscat_analysis._kernels.radial_rows import intervals_needed
 
 CONVERGED, STALLED, EXHAUSTED, ABANDONED = 0, 1, 2, 3
 """Outcome of a fit: step below tolerance; no step improves; iterations used up; little to gain."""
@@ -37,9 +36,14 @@ _TOGETHER = 256
 """Pixels in one block: the slow logarithm is computed only for blocks with bright pixels."""
 
 
+Score = tuple[FloatArray, FloatArray]
+"""Score (5) and Fisher matrix (5, 5), to be filled."""
+
+
 @kernel()
-def signal_value(kind: int, data: FloatArray, level: float, s: FloatArray) -> float:
+def signal_value(measured: Measured, level: float, s: FloatArray) -> float:
     """Log-likelihood of signals s (ny·nx,), relative to that without a particle."""
+    kind, data = measured
     flat, total = data.reshape(4, s.size), 0.0
     for first in range(0, s.size, _TOGETHER):
         last = min(first + _TOGETHER, s.size)
@@ -87,59 +91,32 @@ def _add_score(
         f33 += h3 * g3
         f34 += h3 * g4
         f44 += h4 * g4
-    sums[0] += b0
-    sums[1] += b1
-    sums[2] += b2
-    sums[3] += b3
-    sums[4] += b4
-    sums[5] += f00
-    sums[6] += f01
-    sums[7] += f02
-    sums[8] += f03
-    sums[9] += f04
-    sums[10] += f11
-    sums[11] += f12
-    sums[12] += f13
-    sums[13] += f14
-    sums[14] += f22
-    sums[15] += f23
-    sums[16] += f24
-    sums[17] += f33
-    sums[18] += f34
-    sums[19] += f44
+    for k, value in enumerate((b0, b1, b2, b3, b4, f00, f01, f02, f03, f04)):
+        sums[k] += value
+    for k, value in enumerate((f11, f12, f13, f14, f22, f23, f24, f33, f34, f44)):
+        sums[10 + k] += value
 
 
 @kernel()
-def image_value(kind: int, data: FloatArray, level: float, rows: FloatArray) -> float:
-    """Log-likelihood of an image; `rows` (ny, 5 or more, nx) holds s and its gradient."""
+def image_score(measured: Measured, level: float, rows: FloatArray, into: Score) -> float:
+    """Fill score and Fisher matrix of an image, and give its log-likelihood.
+
+    `rows` (ny, 5 or more, nx) holds s and its gradient.
+    """
+    kind, data = measured
     ny, nx = rows.shape[0], rows.shape[2]
-    flat, total, together = data.reshape(4, ny * nx), 0.0, max(_TOGETHER // nx, 1)
-    s = np.empty(together * nx)
-    for first in range(0, ny, together):
-        last = min(first + together, ny)
-        for i in range(first, last):
-            for j in range(nx):
-                s[(i - first) * nx + j] = rows[i, 0, j]
-        total += value_of_pixels(kind, flat, first * nx, last * nx, level, s)
+    flat, sums, total = data.reshape(4, ny * nx), np.zeros(20), 0.0
+    for row in range(ny):
+        _add_score(kind, flat, row * nx, (row + 1) * nx, level, rows[row], sums)
+        total += value_of_pixels(kind, flat, row * nx, (row + 1) * nx, level, rows[row, 0])
+    _unpack(sums, into)
     return total
 
 
 @kernel()
-def image_score(
-    kind: int, data: FloatArray, level: float, rows: FloatArray, score: FloatArray,
-    fisher: FloatArray,
-) -> None:  # fmt: skip
-    """Fill score (5) and Fisher matrix (5, 5) of an image; `rows` as in `image_value`."""
-    ny, nx = rows.shape[0], rows.shape[2]
-    flat, sums = data.reshape(4, ny * nx), np.zeros(20)
-    for row in range(ny):
-        _add_score(kind, flat, row * nx, (row + 1) * nx, level, rows[row], sums)
-    _unpack(sums, score, fisher)
-
-
-@kernel()
-def _unpack(sums: FloatArray, score: FloatArray, fisher: FloatArray) -> None:
+def _unpack(sums: FloatArray, into: Score) -> None:
     """Fill score and Fisher matrix from the sums of `_add_score`."""
+    score, fisher = into
     k = 5
     for i in range(5):
         score[i] = sums[i]
@@ -150,55 +127,35 @@ def _unpack(sums: FloatArray, score: FloatArray, fisher: FloatArray) -> None:
 
 @kernel()
 def score_pass(
-    profile: FloatArray,
-    lens: Lens,
-    pixels: Pixels,
-    kind: int,
-    data: FloatArray,
-    theta: FloatArray,
-    score: FloatArray,
-    fisher: FloatArray,
-) -> float:
-    """Fill score (5) and Fisher matrix (5, 5) at θ and return the log-likelihood."""
-    level = np.exp(theta[4])
-    ny, nx = pixels.y.size, pixels.x.size
-    if len(lens) == ROUND:  # strip by strip, while the strip is in the first cache
-        flat, sums, total = data.reshape(4, ny * nx), np.zeros(20), 0.0
-        together, f = strip_scratch(pixels)
-        for row in range(0, ny, together):
-            end = min(row + together, ny)
-            here = radial_strip(profile, lens, pixels, row, end, theta[0], theta[1], theta[3], 5, f)
-            _add_score(kind, flat, row * nx, end * nx, level, here, sums)
-            total += value_of_pixels(kind, flat, row * nx, end * nx, level, here[0])
-        _unpack(sums, score, fisher)
-        return total
-    if len(lens) == STAMP:
-        flat, sums, total = data.reshape(4, ny * nx), np.zeros(20), 0.0
-        scratch = begin_stamp(profile, lens, pixels, theta[0], theta[1], theta[3])
-        at, lines = np.empty(TAPS, dtype=np.int64), np.zeros((5, STRIP * nx))
-        for row in range(0, ny, STRIP):
-            end = min(row + STRIP, ny)
-            stamp_strip(profile, lens, theta[3], row, end - row, nx, at, scratch, lines)
-            _add_score(kind, flat, row * nx, end * nx, level, lines, sums)
-            total += value_of_pixels(kind, flat, row * nx, end * nx, level, lines[0])
-        _unpack(sums, score, fisher)
-        return total
-    g = np.empty((ny, 5, nx))
-    signal_gradient(profile, lens, pixels, theta[0], theta[1], theta[3], g)
-    image_score(kind, data, level, g, score, fisher)
-    value: float = image_value(kind, data, level, g)
-    return value
+    profile: FloatArray, lens: Lens, pixels: Pixels, measured: Measured, theta: FloatArray,
+    into: Score,
+) -> float:  # fmt: skip
+    """Fill score and Fisher matrix at θ and return the log-likelihood.
+
+    This goes strip by strip, while the strip is in the first cache.
+    """
+    kind, data = measured
+    level, ny, nx = np.exp(theta[4]), pixels.y.size, pixels.x.size
+    flat, sums, total = data.reshape(4, ny * nx), np.zeros(20), 0.0
+    begun = begin_strips(profile, lens, pixels, theta)
+    together, _, lines = begun
+    for row in range(0, ny, together):
+        end = min(row + together, ny)
+        fill_strip(profile, lens, pixels, theta, row, end, begun)
+        _add_score(kind, flat, row * nx, end * nx, level, lines, sums)
+        total += value_of_pixels(kind, flat, row * nx, end * nx, level, lines[0])
+    _unpack(sums, into)
+    return total
 
 
 @kernel()
 def value_pass(
-    profile: FloatArray, lens: Lens, pixels: Pixels, kind: int, data: FloatArray, theta: FloatArray
+    profile: FloatArray, lens: Lens, pixels: Pixels, measured: Measured, theta: FloatArray
 ) -> float:
     """Log-likelihood at θ, without derivatives."""
-    level = np.exp(theta[4])
     s = np.empty((pixels.y.size, pixels.x.size))
-    signal_image(profile, lens, pixels, theta[0], theta[1], theta[3], s)
-    value: float = signal_value(kind, data, level, s.reshape(s.size))
+    signal_image(profile, lens, pixels, theta, s)
+    value: float = signal_value(measured, np.exp(theta[4]), s.reshape(s.size))
     return value
 
 
@@ -211,7 +168,7 @@ def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int
     if len(lens) == LATTICE:
         first, last = lattice_span(lens, pixels.x, abs(pixels.offsets[-1]), theta[0])
         return first, last
-    return zero, POWERS * intervals_needed(lens, pixels, theta[0], theta[1], width // POWERS)
+    return zero, POWERS * intervals_needed(lens, pixels, theta, width // POWERS)
 
 
 @kernel()
@@ -241,16 +198,10 @@ def picture_at(
 
 @kernel()
 def value_batch(
-    axial: AxialTable,
-    lens: Lens,
-    pixels: Pixels,
-    kind: int,
-    data: FloatArray,
-    thetas: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Fill `out` (n) with the log-likelihood at θ (n, 5); equal z share a profile."""
-    profile = blank_profile(axial, lens, 1)
+    axial: AxialTable, lens: Lens, pixels: Pixels, measured: Measured, thetas: FloatArray
+) -> FloatArray:
+    """Give the log-likelihoods at θ (n, 5); equal z share a profile."""
+    profile, out = blank_profile(axial, lens, 1), np.empty(thetas.shape[0])
     width = axial.heights.shape[3]
     z, first, last = np.nan, 0, 0
     for k in range(thetas.shape[0]):
@@ -260,7 +211,8 @@ def value_batch(
                 start, stop = min(start, first), max(stop, last)
             z, first, last = thetas[k, 2], start, stop
             profile = picture_at(axial, lens, z, first, last, profile)
-        out[k] = value_pass(profile, lens, pixels, kind, data, thetas[k])
+        out[k] = value_pass(profile, lens, pixels, measured, thetas[k])
+    return out
 
 
 @kernel()
@@ -268,36 +220,42 @@ def scoring_step(
     score: FloatArray, fisher: FloatArray, active: BoolArray, damping: float, step: FloatArray
 ) -> bool:
     """Solve (F + damping·diag F) step = score on the active parameters; False if singular."""
-    n = 0
-    index = np.empty(5, dtype=np.int64)
+    index = marked(active)
+    n = index.size
+    scale, lower, z = np.empty(n), np.empty((n, n)), np.empty(n)
     for i in range(5):
         step[i] = 0.0
-        if active[i]:
-            if not fisher[i, i] > 0.0:
-                return False
-            index[n] = i
-            n += 1
-    scale = np.empty(n)
     for i in range(n):
-        scale[i] = 1.0 / np.sqrt(fisher[index[i], index[i]])
-    lower = np.empty((n, n))
-    if not factorise(fisher, index[:n], scale, damping, lower):
-        return False
-    z = np.empty(n)
-    for i in range(n):
+        known = fisher[index[i], index[i]]
+        if not known > 0.0:
+            return False
+        scale[i] = 1.0 / np.sqrt(known)
         z[i] = score[index[i]] * scale[i]
+    if not factorise(fisher, index, scale, damping, lower):
+        return False
     solve(lower, z)
     for i in range(n):
         step[index[i]] = z[i] * scale[i]
     return True
 
 
+Picture = tuple[tuple[Any, ...], tuple[Any, ...], tuple[Any, ...]]
+"""Fields of a table along z, of its lens and of the pixels."""
+
+Search = tuple[BoolArray, FloatArray, FloatArray, FloatArray, float, int, float]
+"""Which parameters are free, lower and upper ends of their box, their largest steps, shape (5,)
+each; tolerance of the likelihood, the most passes, and below which likelihood a maximum is of no
+use."""
+
+Normal = tuple[float, float]
+"""Mean and information of a normal prior of z."""
+
+
 @kernel(_nrt=False)
-def add_prior(
-    prior: tuple[float, float], theta: FloatArray, score: FloatArray, fisher: FloatArray
-) -> float:
-    """Add a normal prior of z to score (5) and Fisher matrix (5, 5); return its logarithm."""
+def add_prior(prior: Normal, theta: FloatArray, into: Score) -> float:
+    """Add a prior of z to score and Fisher matrix; return its logarithm."""
     mean, information = prior
+    score, fisher = into
     away = theta[2] - mean
     score[2] -= information * away
     fisher[2, 2] += information
@@ -307,126 +265,95 @@ def add_prior(
 
 @kernel()
 def maximize(
-    table: tuple[Any, ...],
-    optics: tuple[Any, ...],
-    grid: tuple[Any, ...],
-    kind: int,
-    data: FloatArray,
-    free: BoolArray,
-    lower: FloatArray,
-    upper: FloatArray,
-    max_step: FloatArray,
-    tolerance: float,
-    iterations: int,
-    theta: FloatArray,
-    fisher: FloatArray,
-    least: float,
-    prior: tuple[float, float],
-) -> tuple[float, int, int]:
+    picture: Picture, measured: Measured, search: Search, prior: Normal, theta: FloatArray
+) -> tuple[float, int, int, FloatArray]:
     """Damped Fisher scoring inside a box, from θ, which is overwritten with the estimate.
 
-    `prior` has mean and information of a normal prior of z; zero information means no prior.
-
-    Shapes: `data` (4, ny, nx), `free` (5,), `lower, upper, max_step` (5,), `theta` (5,), `fisher`
-    (5, 5).
+    Gives its log-likelihood, the passes, how it ended, and its Fisher matrix.  Zero information
+    of the prior means none.
     """
+    table, optics, grid = picture
+    free, lower, upper, max_step, tolerance, iterations, least = search
     axial, lens, pixels = AxialTable(*table), named_lens(optics), Pixels(*grid)
     profile = blank_profile(axial, lens, 2)
     width = axial.heights.shape[3]
     step, trial, score = np.empty(5), np.empty(5), np.empty(5)
-    trial_score, trial_fisher = np.empty(5), np.empty((5, 5))
+    fisher, trial_score, trial_fisher = np.empty((5, 5)), np.empty(5), np.empty((5, 5))
     active = np.empty(5, dtype=np.bool_)
     damping = 0.0
     start, stop = (0, width) if not free[2] else span(lens, pixels, theta, width)
     profile = picture_at(axial, lens, theta[2], start, stop, profile)
-    value = score_pass(profile, lens, pixels, kind, data, theta, score, fisher)
-    value += add_prior(prior, theta, score, fisher)
+    value = score_pass(profile, lens, pixels, measured, theta, (score, fisher))
+    value += add_prior(prior, theta, (score, fisher))
     passes = 1
     while passes < iterations:
         for i in range(5):
-            blocked = (theta[i] <= lower[i] and score[i] < 0) or (
-                theta[i] >= upper[i] and score[i] > 0
-            )
-            active[i] = free[i] and not blocked
-        if not scoring_step(score, fisher, active, damping, step):
-            if damping > 1e6:
-                return value, passes, STALLED
-            damping = max(10 * damping, 1e-3)
-            continue
-        largest_gain = 0.0
-        for i in range(5):
-            largest_gain += 0.5 * LARGEST_GAIN_RATIO * score[i] * step[i]
-        shrink = 1.0
-        for i in range(5):
-            if active[i] and abs(step[i]) * shrink > max_step[i]:
-                shrink = max_step[i] / abs(step[i])
-        gain = 0.0
-        for i in range(5):
-            trial[i] = min(max(theta[i] + shrink * step[i], lower[i]), upper[i])
-            gain += 0.5 * score[i] * (trial[i] - theta[i])
-        if not np.isfinite(gain):  # an overflow: a NaN position must not become an index
-            return value, passes, STALLED
-        if damping == 0.0 and gain < tolerance:
+            outwards = theta[i] <= lower[i] and score[i] < 0
+            outwards |= theta[i] >= upper[i] and score[i] > 0
+            active[i] = free[i] and not outwards
+        if scoring_step(score, fisher, active, damping, step):
+            shrink = 1.0
             for i in range(5):
-                theta[i] = trial[i]
-            return value + gain, passes, CONVERGED
-        if damping == 0.0 and value + largest_gain < least:
+                if active[i] and abs(step[i]) * shrink > max_step[i]:
+                    shrink = max_step[i] / abs(step[i])
+            gain = largest_gain = 0.0
             for i in range(5):
-                theta[i] = trial[i]
-            return value + gain, passes, ABANDONED
-        if free[2]:
-            start, stop = span(lens, pixels, trial, width)
-            profile_at(axial, trial[2], start, stop, profile)
-        trial_value = score_pass(
-            profile, lens, pixels, kind, data, trial, trial_score, trial_fisher
-        )
-        trial_value += add_prior(prior, trial, trial_score, trial_fisher)
-        passes += 1
-        if trial_value >= value - 1e-3 * tolerance - 1e-13 * abs(value):
-            value = trial_value
-            for i in range(5):  # a slice assignment would also compile its error message
-                theta[i], score[i] = trial[i], trial_score[i]
-                for j in range(5):
-                    fisher[i, j] = trial_fisher[i, j]
-            damping = 0.0 if damping < 1e-2 else 0.1 * damping
-        else:
-            if damping > 1e6:
-                return value, passes, STALLED
-            damping = max(10 * damping, 1e-3)
-    return value, passes, EXHAUSTED
+                trial[i] = min(max(theta[i] + shrink * step[i], lower[i]), upper[i])
+                gain += 0.5 * score[i] * (trial[i] - theta[i])
+                largest_gain += 0.5 * LARGEST_GAIN_RATIO * score[i] * step[i]
+            if not np.isfinite(gain):  # an overflow: a NaN position must not become an index
+                return value, passes, STALLED, fisher
+            if damping == 0.0 and (gain < tolerance or value + largest_gain < least):
+                copy_line(trial, theta)
+                outcome = CONVERGED if gain < tolerance else ABANDONED
+                return value + gain, passes, outcome, fisher
+            if free[2]:
+                start, stop = span(lens, pixels, trial, width)
+                profile_at(axial, trial[2], start, stop, profile)
+            into = trial_score, trial_fisher
+            there = score_pass(profile, lens, pixels, measured, trial, into)
+            there += add_prior(prior, trial, into)
+            passes += 1
+            if there >= value - 1e-3 * tolerance - 1e-13 * abs(value):
+                value = there
+                copy_line(trial, theta)
+                copy_line(trial_score, score)
+                copy_line(trial_fisher.reshape(25), fisher.reshape(25))
+                damping = 0.0 if damping < 1e-2 else 0.1 * damping
+                continue
+        if damping > 1e6:
+            return value, passes, STALLED, fisher
+        damping = max(10 * damping, 1e-3)
+    return value, passes, EXHAUSTED, fisher
 
 
 @kernel()
 def scan_heights(
-    table: tuple[Any, ...],
-    optics: tuple[Any, ...],
-    grid: tuple[Any, ...],
-    kind: int,
-    data: FloatArray,
+    picture: Picture,
+    measured: Measured,
     heights: FloatArray,
-    amplitude_range: tuple[float, float],
+    limits: tuple[float, float],
     theta: FloatArray,
-    values: FloatArray,
-    amplitudes: FloatArray,
-) -> None:
+) -> FloatArray:
     """Profile log-likelihood along z at fixed (x, y): the amplitude takes two scoring steps.
 
-    Fills `values` and `amplitudes`, shape (n,), for `heights`; θ gives the other parameters and the
-    start.  An empty amplitude range holds the amplitude fixed.  The first three arguments are those
-    of `maximize`.
+    Gives values and amplitudes, shape (2, n), for `heights` (n,); θ has the other parameters and
+    the start.  Empty limits of the amplitude hold it fixed.
     """
+    table, optics, grid = picture
+    kind, data = measured
     axial, lens, pixels = AxialTable(*table), named_lens(optics), Pixels(*grid)
     profile = blank_profile(axial, lens, 1)
     here, size = theta.copy(), pixels.y.size * pixels.x.size
     flat, parts, s = data.reshape(4, size), np.empty((2, size)), np.empty(size)
-    p, q = parts[0], parts[1]
-    low, high = amplitude_range
-    unit, level = theta[3] if theta[3] != 0.0 else 1.0, np.exp(theta[4])
+    p, q, out = parts[0], parts[1], np.empty((2, heights.size))
+    low, high = limits
+    here[3], level = theta[3] if theta[3] != 0.0 else 1.0, np.exp(theta[4])
     for k in range(heights.size):
         here[2] = heights[k]
         start, stop = span(lens, pixels, here, axial.heights.shape[3])
         profile_at(axial, here[2], start, stop, profile)
-        signal_parts(profile, lens, pixels, theta[0], theta[1], unit, parts)
+        signal_parts(profile, lens, pixels, here, parts)
         a = theta[3]
         for _ in range(2 if low < high else 0):
             pull, known = _amplitude(kind, flat, level, a, p, q)
@@ -434,8 +361,8 @@ def scan_heights(
                 a = min(max(a + pull / known, low), high)
         for j in range(s.size):
             s[j] = a * (p[j] + a * q[j])
-        values[k] = signal_value(kind, data, level, s)
-        amplitudes[k] = a
+        out[0, k], out[1, k] = signal_value(measured, level, s), a
+    return out
 
 
 @kernel(fastmath=FAST)
@@ -459,17 +386,14 @@ SLACK_NM = 1e-6
 
 
 @kernel()
-def supported(
-    thetas: FloatArray,
-    x: FloatArray,
-    y: FloatArray,
-    half_pixel: float,
-    reach: float,
-    low: float,
-    high: float,
-    largest_level: float,
-) -> BoolArray:
-    """Tell for which θ (n, 5) all pixels are within reach, z is in the table and all is finite."""
+def supported(thetas: FloatArray, grid: tuple[Any, ...], limits: tuple[float, ...]) -> BoolArray:
+    """Tell for which θ (n, 5) all pixels are within reach, z is in the table and all is finite.
+
+    `grid` has the centres of the pixels and half their side, `limits` the reach, the lowest and the
+    highest z, and the largest logarithm of the level.
+    """
+    x, y, half_pixel = grid
+    reach, low, high, largest_level = limits
     inside = np.empty(thetas.shape[0], dtype=np.bool_)
     for k in range(thetas.shape[0]):
         dx = max(abs(thetas[k, 0] - x[0]), abs(thetas[k, 0] - x[-1])) + half_pixel
@@ -485,29 +409,19 @@ def supported(
 
 @kernel()
 def box_supported(
-    start: FloatArray,
-    free: BoolArray,
-    lower: FloatArray,
-    upper: FloatArray,
-    x: FloatArray,
-    y: FloatArray,
-    half_pixel: float,
-    reach: float,
-    low: float,
-    high: float,
-    largest_level: float,
-) -> tuple[bool, bool]:
-    """Tell whether a box contains the start of the free parameters, and is in the support."""
-    inside = True
+    box: tuple[BoolArray, FloatArray, FloatArray], start: FloatArray, grid: tuple[Any, ...],
+    limits: tuple[float, ...],
+) -> bool:  # fmt: skip
+    """Tell whether a box of free parameters around a start is in the support."""
+    free, lower, upper = box
     corners = np.empty((4, 5))
     for i in range(5):
-        if free[i] and not lower[i] <= start[i] <= upper[i]:
-            inside = False
         for k in range(4):
             corners[k, i] = start[i]
         if free[i] and i < 3:
             corners[0, i], corners[1, i] = lower[i], upper[i]
             corners[2, i] = lower[i] if i == 0 else upper[i]
             corners[3, i] = upper[i] if i == 0 else lower[i]
-    known = supported(corners, x, y, half_pixel, reach, low, high, largest_level)
-    return inside, known[0] and known[1] and known[2] and known[3]
+    known = supported(corners, grid, limits)
+    inside: bool = known[0] and known[1] and known[2] and known[3]
+    return inside

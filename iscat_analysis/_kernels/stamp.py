@@ -40,6 +40,10 @@ The first five are those of `signal_gradient`, with ∂xx in place of ∂z, whic
 _WEIGHTS = 6 * TAPS + 3  # weights along x and y, two derivatives, the first nodes, the amplitude
 _SIGNAL, _GRADIENT, _BENT = 1, 4, 9  # images: S; ∂xS, ∂yS and D; ∂xxS, ∂xyS, ∂yyS, ∂xD and ∂yD
 _PLACES = (0, 1, 2, 4, 3, 5, 6, 7, 8)  # of the images in a row of pixels
+# S, ∂yS, D, ∂yyS and ∂yD along y: the order of their weights, and whether they are made of D
+_ALONG_Y = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1))
+# of each image the one along y that it is made of, and the order of its weights along x
+_ALONG_X = ((0, 0), (0, 1), (1, 0), (2, 0), (0, 2), (1, 1), (3, 0), (2, 1), (4, 0))
 
 
 @kernel()
@@ -52,33 +56,33 @@ def _sizes(lens: StampLens, columns: int) -> tuple[int, int, int, int]:
 
 @kernel(_nrt=False)
 def _first_nodes(
-    profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float
+    profile: AnyFloatArray, lens: StampLens, pixels: Pixels, theta: FloatArray
 ) -> tuple[float, float]:
     """Position of the first pixel on the nodes [nodes]; the nodes of all pixels exist."""
     room = TAPS - BEFORE
     last_x = profile.shape[2] - room - lens.fine * (pixels.x.size - 1)
     last_y = profile.shape[1] - room - lens.fine * (pixels.y.size - 1)
-    x = (pixels.x[0] - x_p) * lens.inv_step + lens.half
-    y = (pixels.y[0] - y_p) * lens.inv_step + lens.half
+    x = (pixels.x[0] - theta[0]) * lens.inv_step + lens.half
+    y = (pixels.y[0] - theta[1]) * lens.inv_step + lens.half
     least = float(BEFORE)
     return within(x, least, float(last_x)), within(y, least, float(last_y))
 
 
 @kernel()
 def begin_stamp(
-    profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float,
-    amplitude: float, images: int = _GRADIENT,
+    profile: AnyFloatArray, lens: StampLens, pixels: Pixels, theta: FloatArray,
+    images: int = _GRADIENT,
 ) -> AnyFloatArray:  # fmt: skip
     """Work space of an image, the weights of all of its pixels at the beginning."""
     _, block, made, strip = _sizes(lens, pixels.x.size)
     size = lens.fine * (2 * block + (1 + images // 2) * made) + images * strip
     w = np.empty(_WEIGHTS + size, profile.dtype)
-    x, y = _first_nodes(profile, lens, pixels, x_p, y_p)
+    x, y = _first_nodes(profile, lens, pixels, theta)
     i, j, orders = int(x), int(y), 3 if images == _BENT else 2
     weights = w[: 6 * TAPS].reshape(2, 3, TAPS)
     taps(lens.window, x - i, lens.inv_step, weights[0, :orders])
     taps(lens.window, y - j, lens.inv_step, weights[1, :orders])
-    w[6 * TAPS], w[6 * TAPS + 1], w[6 * TAPS + 2] = i - BEFORE, j - BEFORE, amplitude
+    w[6 * TAPS], w[6 * TAPS + 1], w[6 * TAPS + 2] = i - BEFORE, j - BEFORE, theta[3]
     return w
 
 
@@ -106,29 +110,6 @@ def _copy_nodes(
                 s[j] = p[j] + a * q[j]
 
 
-@kernel(fastmath=FAST, _nrt=False)
-def _mix(nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, out: AnyFloatArray) -> None:
-    """Fill `out` with the combination w of the lines that begin at TAPS places of `nodes`."""
-    n = out.size
-    for k in range(0, TAPS, 4):
-        a, b = nodes[at[k] : at[k] + n], nodes[at[k + 1] : at[k + 1] + n]
-        c, d = nodes[at[k + 2] : at[k + 2] + n], nodes[at[k + 3] : at[k + 3] + n]
-        mix(a, b, c, d, w, k, out)
-
-
-@kernel(fastmath=FAST, _nrt=False)
-def _mix_both(
-    nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, v: AnyFloatArray,
-    out: AnyFloatArray, other: AnyFloatArray,
-) -> None:  # fmt: skip
-    """Fill `out` and `other` with two combinations of the same nodes; see `_mix`."""
-    n = out.size
-    for k in range(0, TAPS, 4):
-        a, b = nodes[at[k] : at[k] + n], nodes[at[k + 1] : at[k + 1] + n]
-        c, d = nodes[at[k + 2] : at[k + 2] + n], nodes[at[k + 3] : at[k + 3] + n]
-        mix_both(a, b, c, d, w, v, k, out, other)
-
-
 @kernel(_nrt=False)
 def _make_strip(
     profile: AnyFloatArray, lens: StampLens, row: int, rows: int, columns: int,
@@ -150,7 +131,6 @@ def _make_strip(
         at[k] = k % fine * block + k // fine * line
     used, kept, size, first = rows * line, fine * block, fine * made, left // fine
     last = min(first + line, per_phase)
-    value, slope, bend = weights[1, 0], weights[1, 1], weights[1, 2]
     for phase in range(fine):
         for k in range(fine):
             start = k * block
@@ -160,49 +140,42 @@ def _make_strip(
                 profile, top + k, fine, phase * per_phase + first, phase * per_phase + last, line,
                 a, nodes[start:stop], nodes[kept + start : end],
             )  # fmt: skip
-        s, s_y = phase * made, phase * made + size
-        d, s_yy, d_y = s_y + size, s_y + 2 * size, s_y + 3 * size
+        here = sums[phase * made :]
         if images == _SIGNAL:
-            _mix(nodes[:kept], at, value, sums[s : s + used])
+            mix(nodes, at, weights[1, 0], here[:used])
             continue
-        _mix_both(nodes[:kept], at, value, slope, sums[s : s + used], sums[s_y : s_y + used])
-        _mix(nodes[kept:], at, value, sums[d : d + used])
-        if images == _BENT:
-            _mix(nodes[:kept], at, bend, sums[s_yy : s_yy + used])
-            _mix(nodes[kept:], at, slope, sums[d_y : d_y + used])
+        mix_both(nodes, at, weights[1], here[:used], here[size : size + used])
+        for k in range(2, 1 + images // 2):
+            order, doubled = _ALONG_Y[k]
+            made_y = here[k * size : k * size + used]
+            mix(nodes[kept * doubled :], at, weights[1, order], made_y)
     phase = left % fine
     for k in range(TAPS):
         at[k] = (phase + k) % fine * made + (phase + k) // fine
     out: int = _WEIGHTS + 2 * fine * block + (1 + images // 2) * size
     made_images, used = w[out:], used - (line - columns)
-    value, slope, bend = weights[0, 0], weights[0, 1], weights[0, 2]
     if images == _SIGNAL:
-        _mix(sums, at, value, made_images[:used])
+        mix(sums, at, weights[0, 0], made_images[:used])
         return out
-    _mix_both(sums, at, value, slope, made_images[:used], made_images[strip : strip + used])
-    _mix(sums[size:], at, value, made_images[2 * strip : 2 * strip + used])
-    _mix(sums[2 * size :], at, value, made_images[3 * strip : 3 * strip + used])
-    if images == _BENT:
-        _mix(sums, at, bend, made_images[4 * strip : 4 * strip + used])
-        _mix(sums[size:], at, slope, made_images[5 * strip : 5 * strip + used])
-        _mix(sums[3 * size :], at, value, made_images[6 * strip : 6 * strip + used])
-        _mix(sums[2 * size :], at, slope, made_images[7 * strip : 7 * strip + used])
-        _mix(sums[4 * size :], at, value, made_images[8 * strip : 8 * strip + used])
+    mix_both(sums, at, weights[0], made_images[:used], made_images[strip : strip + used])
+    for k in range(2, images):
+        source, order = _ALONG_X[k]
+        made_x = made_images[k * strip : k * strip + used]
+        mix(sums[source * size :], at, weights[0, order], made_x)
     return out
 
 
 @kernel()
 def stamp_gradient(
-    profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float,
-    amplitude: float, out: AnyFloatArray,
-) -> None:  # fmt: skip
+    profile: AnyFloatArray, lens: StampLens, pixels: Pixels, theta: FloatArray, out: AnyFloatArray
+) -> None:
     """Fill `out` with signal and gradient (ny, 5, nx), ∂s/∂z 0, or second derivatives too.
 
     These have shape (ny, BENDS, nx).
     """
     images = _BENT if out.shape[1] == BENDS else _GRADIENT
-    f = begin_stamp(profile, lens, pixels, x_p, y_p, amplitude, images)
-    _fill_rows(profile, lens, amplitude, images, np.empty(TAPS, dtype=np.int64), f, out)
+    f = begin_stamp(profile, lens, pixels, theta, images)
+    _fill_rows(profile, lens, theta[3], images, np.empty(TAPS, dtype=np.int64), f, out)
 
 
 @kernel(fastmath=FAST, _nrt=False)
@@ -235,15 +208,17 @@ def _fill_rows(
 
 @kernel(fastmath=FAST, _nrt=False)
 def stamp_strip(
-    profile: AnyFloatArray, lens: StampLens, amplitude: float, row: int, rows: int, columns: int,
-    at: IntArray, f: AnyFloatArray, out: AnyFloatArray,
+    profile: AnyFloatArray, lens: StampLens, row: int, rows: int, columns: int,
+    work: tuple[AnyFloatArray, IntArray], out: AnyFloatArray,
 ) -> None:  # fmt: skip
     """Fill `out` (5, rows·columns or more) with signal and gradient of a strip of rows.
 
-    All of its pixels follow one another; ∂s/∂z is 0 and not written.  `f` comes from
-    `begin_stamp`, `at` (TAPS) is work space.
+    All of its pixels follow one another; ∂s/∂z is 0 and not written.  `work` is what comes from
+    `begin_stamp`, and TAPS numbers.
     """
     line, _, _, strip = _sizes(lens, columns)
+    f, at = work
+    amplitude = f[6 * TAPS + 2]
     begin = _make_strip(profile, lens, row, rows, columns, np.int64(_GRADIENT), at, f)
     for k in range(_GRADIENT):
         there = out[_PLACES[k]]
@@ -257,23 +232,13 @@ def stamp_strip(
 
 
 @kernel()
-def stamp_signal(
-    profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float,
-    amplitude: float, out: FloatArray,
-) -> None:  # fmt: skip
-    """Fill `out` (ny, nx) with the signal of an image."""
-    out[:] = 0.0
-    add_stamp(profile, lens, pixels, x_p, y_p, amplitude, 1.0, out)
-
-
-@kernel()
 def add_stamp(
-    profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float,
-    amplitude: float, sign: float, out: AnyFloatArray,
+    profile: AnyFloatArray, lens: StampLens, pixels: Pixels, theta: FloatArray, sign: float,
+    out: AnyFloatArray,
 ) -> None:  # fmt: skip
     """Add the signal of an image, times a sign, to `out` (ny, nx), in the latter's precision."""
-    f = begin_stamp(profile, lens, pixels, x_p, y_p, amplitude)
-    _add_signal(profile, lens, sign * amplitude, np.empty(TAPS, dtype=np.int64), f, out)
+    f = begin_stamp(profile, lens, pixels, theta)
+    _add_signal(profile, lens, sign * theta[3], np.empty(TAPS, dtype=np.int64), f, out)
 
 
 @kernel(fastmath=FAST, _nrt=False)

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from iscat_analysis._kernels import FAST, AnyFloatArray, BoolArray, FloatArray, IntArray, kernel
-from iscat_analysis._kernels.background_response import Slopes, keep_slopes
-from iscat_analysis._kernels.canvas import (
-    Canvas,
-    Field,
-    Light,
-    Pictures,
-    Rows,
-    cut,
-    draw_gradient,
-    lens_of,
-    square_of,
-    stage,
-)
+from iscat_analysis._kernels.background_response import keep_slopes
+from iscat_analysis._kernels.canvas import Pictures, Rows, cut, draw, lens_of, square_of, stage
 from iscat_analysis._kernels.lens import STAMP, Lens, Pixels
 from iscat_analysis._kernels.loops import copy_line, factorise, largest
-from iscat_analysis._kernels.moving import LEAST, Room, place_score
+from iscat_analysis._kernels.moving import LEAST, Room, Scene, place_score
 from iscat_analysis._kernels.noise import FLOOR
 from iscat_analysis._kernels.stamp import BENDS
 
@@ -89,17 +80,23 @@ def _left_over(
     numbers[4] = more / known if known > zero else zero
 
 
+class Judgements(NamedTuple):
+    """Of every row: information, O V, V (n, 4, 4), bias (n, 4), and the numbers of tests (n, 6)."""
+
+    fisher: FloatArray
+    turned: FloatArray
+    ways: FloatArray
+    bias: FloatArray
+    numbers: FloatArray
+
+
 @kernel(_nrt=False)
 def judge_frames(
-    light: Light, field: Field, near: Pictures, free: BoolArray, particles: Rows, first: int,
-    last: int, canvas: Canvas, slopes: Slopes, fisher: FloatArray, turned: FloatArray,
-    ways: FloatArray, bias: FloatArray, numbers: FloatArray, room: Room,
-) -> None:  # fmt: skip
-    """Fill information, bias and tests of the rows of frames first…last − 1, at θ.
-
-    Shapes: `fisher` (rows, 4, 4), `turned, ways` (rows, 4, 4), `bias` (rows, 4), `numbers` (rows,
-    6).
-    """
+    scene: Scene, free: BoolArray, particles: Rows, first: int, last: int, out: Judgements
+) -> None:
+    """Fill information, bias and tests of the rows of frames first…last − 1, at θ."""
+    light, field, near, canvas, slopes, room = scene
+    fisher, turned, ways, bias, numbers = out
     starts, theta, group = particles
     rows, columns = light.background.shape
     area, index, ways_here = field.side**2, room.free, room.ways
@@ -114,7 +111,7 @@ def judge_frames(
             pixels = cut(field.pixels, r0, r1, c0, c1)
             m = _rows_drawn(near.lens)
             here = g[: m * ny * nx].reshape(ny, m, nx)
-            draw_gradient(near, group[r], p, pixels, room.profile, here)
+            draw(near, group[r], p, pixels, room.profile, here)
             data = room.pixels[: 4 * ny * nx].reshape(4, ny, nx)
             stage(light, t, canvas.total[t], here, r0, c0, data)
             keep_slopes(data[2], here, index, slopes, r, (r0, r1, c0, c1), room.line)
@@ -143,7 +140,7 @@ def judge_frames(
 
 @kernel(_nrt=False)
 def _rows_drawn(lens: Lens) -> int:
-    """Give how many numbers `draw_gradient` is asked for of each pixel."""
+    """Give how many numbers `draw` is asked for of each pixel."""
     return int(np.int64(BENDS if len(lens) == STAMP else 5))  # a literal has its own type
 
 
@@ -173,7 +170,7 @@ def _curve(
                 trial[a] += step * ways[a, k]
             if free[2]:
                 trial[2] = min(max(trial[2], low), high)
-            draw_gradient(near, group, trial, pixels, room.profile, both[sign])
+            draw(near, group, trial, pixels, room.profile, both[sign])
             place_score(data, both[sign], near.lens, pulls[sign], known)
         _add_curvature(data, here, both[0], both[1], bias)
         for a in range(4):

@@ -64,14 +64,10 @@ def joint_information(
 
     Shapes: `theta` (5,), `others` (ny, nx) each, result (n, n).
     """
-    x, y, z, amplitude, level = theta.tolist()
     model, grid = likelihood.model, likelihood.grid
-    signal, own = model.signal(grid, theta[:4])
-    further = [*others]
-    if names:
-        place = (grid, x, y, z, float(model.scale.mass(np.array(amplitude))))
-        further += [*model.joint_gradient(*place, names)[2]]
-    return likelihood.score_of_signal(signal, np.array([*further, *own]), level)[2]
+    signal, slopes = model.signal(grid, theta[:4], names)
+    ordered = np.array([*others, *slopes[4:], *slopes[:4]])
+    return likelihood.score_of_signal(signal, ordered, float(theta[4]))[2]
 
 
 def eliminated(information: FloatArray, shared: int) -> FloatArray:
@@ -153,8 +149,8 @@ def peak_gradient(
     # where the signal is largest its place does not matter to first order
     there = PixelGrid(np.array([x]), np.array([y]), _PEAK_NM)
     at = (0.0, 0.0, z_nm, amplitude)
-    contrast, own, shared = model.amplitude_joint_gradient(there, *at, names)
-    return float(contrast[0, 0]), own[:, 0, 0], shared[:, 0, 0]
+    contrast, slopes = model.signal(there, at, names)
+    return float(contrast[0, 0]), slopes[:4, 0, 0], slopes[4:, 0, 0]
 
 
 def shared_sigma(moves: FloatArray, covariance: FloatArray) -> FloatArray:

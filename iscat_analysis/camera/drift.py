@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
 
-from iscat_analysis._kernels.light import extend, mismatch, shift_equations
 from iscat_analysis.medians import SIGMA_PER_MAD, median_3x3, robust_sigma
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
 
@@ -35,6 +34,7 @@ REACH_PX = 4
 """From the edges of a field, within which a moved pattern is not to be trusted."""
 
 _SETTLED_PX = 1e-5
+_SLOPE_VARIANCE = 130 / 144  # of `_slopes`, over that of a pixel
 
 
 def middle_of(shape: tuple[int, ...], most_px: int) -> tuple[slice, slice]:
@@ -119,24 +119,32 @@ def _register(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Shift (y, x) of an image against a pattern, its error, and how clear the pattern is."""
     spectrum = mover.spectrum(pattern)
-    deviation = np.empty(pattern.shape)
-    normal, right = np.empty((3, 3)), np.empty(3)
     nowhere = math.inf, np.zeros(2), np.full(2, math.inf), 0.0
 
     def refined(shift: FloatArray) -> tuple[float, FloatArray, FloatArray, float]:
         for _ in range(4):  # passes settle
             moved = pattern
             if shift.any():
-                image_there = mover.image(spectrum * mover.transfer(shift[None], np.ones(1)))
-                moved = np.ascontiguousarray(image_there)  # a cut would compile its own kernels
-            mismatch(moved, image, usable, pattern_read, image_read, ratio, deviation)
+                moved = mover.image(spectrum * mover.transfer(shift[None], np.ones(1)))
+            expected = ratio * moved
+            variance = (1 + ratio) * expected + image_read + ratio**2 * pattern_read
+            lit = usable & (expected > 0)
+            deviation = np.full(moved.shape, np.nan)
+            noise = np.sqrt(np.maximum(variance, 0.0))
+            np.divide(image - expected, noise, where=lit, out=deviation)
             some = np.abs(deviation[::2, ::3])
             if np.isnan(some).all():
                 return nowhere
             scale = max(SIGMA_PER_MAD * float(np.nanmedian(some)), 1.0)
-            read = pattern_read, image_read, ratio
-            # a pixel beyond four standard deviations does not count
-            spurious = shift_equations(moved, *read, deviation, 4.0 * scale, normal, right)
+            z = np.where(np.abs(deviation) <= 4.0 * scale, deviation, np.nan)[2:-2, 2:-2]
+            used = np.isfinite(z)
+            per = ratio / np.sqrt(variance[2:-2, 2:-2][used])
+            slopes = np.stack([*(-step[used] for step in _slopes(moved)), moved[2:-2, 2:-2][used]])
+            slopes *= per
+            own = (moved + pattern_read)[2:-2, 2:-2][used]
+            spurious = _SLOPE_VARIANCE * float(per**2 @ own)  # that the noise of slopes adds
+            normal, right = slopes @ slopes.T, slopes @ z[used]
+            normal[[0, 1], [0, 1]] -= spurious
             clear = float(normal[0, 0] + normal[1, 1]) / max(2 * spurious, 1e-300)
             if not clear > 0 or np.linalg.eigvalsh(normal)[0] <= 0:
                 return nowhere
@@ -155,6 +163,24 @@ def _register(
     return found[1:]
 
 
+def _slopes(image: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Slopes along y and x by five pixels, two pixels from the edges on."""
+    along = [
+        (part[:-4] - 8 * part[1:-3] + 8 * part[3:-1] - part[4:]) / 12
+        for part in (image[:, 2:-2], image.T[:, 2:-2])
+    ]
+    return along[0], along[1].T
+
+
+def _continued(image: FloatArray, more: int) -> FloatArray:
+    """Continue the rows of an image by a blend of their reflections, so that their ends meet."""
+    size, k = len(image), np.arange(more)
+    share = ((k + 1) / (more + 1))[:, None]
+    fade = share**3 * (10 + share * (6 * share - 15))
+    near, far = image[np.maximum(size - 1 - k, 0)], image[np.minimum(more - 1 - k, size - 1)]
+    return np.concatenate([image, (1 - fade) * near + fade * far])
+
+
 class Mover:
     """Moves images of one size by any part of a pixel, by the phase of their spectra.
 
@@ -170,9 +196,9 @@ class Mover:
 
     def spectrum(self, image: FloatArray) -> ComplexArray:
         """Spectrum of an image, shape (v, u)."""
-        extended = np.empty(self._size)
-        extend(np.ascontiguousarray(image), extended)
-        spectrum: ComplexArray = fft.rfft2(extended)
+        more_y, more_x = np.subtract(self._size, self._shape).tolist()
+        wide = _continued(image.T, more_x).T
+        spectrum: ComplexArray = fft.rfft2(_continued(wide, more_y))
         return spectrum
 
     def image(self, spectrum: ComplexArray) -> FloatArray:

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, find_objects, label, median_filter
 from scipy.special import chdtri
 
-from iscat_analysis._kernels.light import add_image, add_scatter, block_extremes, block_powers
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.camera import PIXELS_UNSTEADY, TEXT_BURNT_IN
@@ -179,30 +178,28 @@ def find_unsteady(
     if freedom[0] < 20 or freedom[1] < 4:  # frames that tell
         return None
     shape = blocks[0].shape[1:]
-    summed = np.zeros(shape)
-    highest, still = blocks[0][0].copy(), np.ones(shape, dtype=np.bool_)
-    for block in blocks:
-        block_extremes(block, summed, highest, still)
-    light = camera.to_electrons(summed / frames.sum())
+    highest = np.max([block.max(axis=0) for block in blocks], axis=0)
+    still = np.all([(block == block[0]).all(axis=0) for block in blocks], axis=0)
+    summed = sum(block.sum(axis=0, dtype=np.float64) for block in blocks)
+    light = camera.to_electrons(np.asarray(summed / frames.sum()))
     lit = light > max(20.0, 0.1 * float(np.median(light)))  # below it noise is far from normal
     lit &= ~camera.saturated(highest)
     level = float(light[lit].mean()) if lit.any() else 0.0
     if lit.mean() < 0.5:
         return None
     variance = np.where(lit, light + camera.read_variance_e2(light.shape), np.inf)
-    gain, offset = (
-        np.full(shape, value, dtype=np.float64)
-        for value in (camera.gain_e_per_adu, camera.offset_adu)
-    )
     fast, slow = _Scatter(shape), _Scatter(shape)
     found = lit & still
-    mean, change = np.empty(shape), np.empty(shape)
     for block in blocks:
-        power = block_powers(block, gain, offset, lit) / level
+        electrons = camera.to_electrons(block)
+        power = electrons[:, lit].mean(axis=1) / level
         if power.min() <= 0:
             return None
-        add_scatter(block, gain, offset, power, mean, change, fast.squares, fast.products)
-        add_image((mean - light) * np.sqrt(len(block)), slow.squares, slow.products)
+        steady = electrons / power[:, None, None]
+        mean = steady.mean(axis=0)
+        for frame in steady:
+            fast.add(frame - mean)
+        slow.add((mean - light) * np.sqrt(len(block)))
     for scatter, number in ((fast, freedom[0]), (slow, freedom[1])):
         ratio = np.where(lit, scatter.squares / variance / number, 0.0)
         usual = float(np.median(ratio[lit]))
@@ -223,10 +220,15 @@ def find_unsteady(
 
 def _largest_neighbour(values: FloatArray) -> FloatArray:
     """Larger one of the two neighbours, along the axis where it is smaller."""
-    padded = np.pad(values, 1, mode="reflect")
-    along_y = np.maximum(padded[:-2, 1:-1], padded[2:, 1:-1])
-    along_x = np.maximum(padded[1:-1, :-2], padded[1:-1, 2:])
+    along_y, along_x = (np.maximum(*both) for both in _neighbours(values))
     return np.minimum(along_y, along_x)
+
+
+def _neighbours(values: FloatArray) -> tuple[tuple[FloatArray, ...], ...]:
+    """Both neighbours of every pixel along y, and along x; at an edge twice the inner one."""
+    padded = np.pad(values, 1, mode="reflect")
+    along_y = padded[:-2, 1:-1], padded[2:, 1:-1]
+    return along_y, (padded[1:-1, :-2], padded[1:-1, 2:])
 
 
 class _Scatter:
@@ -235,6 +237,12 @@ class _Scatter:
     def __init__(self, shape: tuple[int, ...]) -> None:
         self.squares = np.zeros(shape)
         self.products = np.zeros((2, *shape))
+
+    def add(self, image: FloatArray) -> None:
+        """Add one image."""
+        self.squares += image**2
+        for products, (one, other) in zip(self.products, _neighbours(image), strict=True):
+            products += image * (one + other) / 2
 
 
 def _noisy_lines(ratio: FloatArray, lit: BoolArray, usual: float, least_beside: float) -> BoolArray:

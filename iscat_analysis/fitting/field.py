@@ -64,139 +64,244 @@ def fit_field(
     progress: Progress = silent,
 ) -> tuple[tuple[Event, ...], Windows]:
     """Find and fit every particle in a field."""
-    events: list[Fitted] = []
-    if not starts:
-        events, windows = _large_ones(context, windows, pool)
+    field = FieldFit(context, windows, excess_noise, pool)
+    events = [] if starts else field.large_ones()
     fresh, doubtful = list(starts), list[Candidate]()
     for number in range(MAX_ROUNDS):
         progress("detect", number, MAX_ROUNDS)
         if number or not fresh:
-            fresh, doubtful = search_field(context, windows, events, excess_noise)
+            fresh, doubtful = field.search(events)
         if not fresh and (number or not starts):
             break
-        events = _fit_all(context, windows, [*(e.candidate for e in events), *fresh], events, pool)
-        windows = _refined(context, windows, events)
-    events, windows = _settled(context, windows, events, pool)
+        events = field.fit(events, fresh)
+        field.refine_power(events)
+    events = field.settled(events)
     large = with_spheres(context, events, pool, level=False)
     if any(new.sphere and not old.sphere for new, old in zip(large, events, strict=True)):
-        events, windows = _settled(context, windows, large, pool)
-    trial = None if starts else _with_concealed(context, windows, events, excess_noise, pool)
+        events = field.settled(large)
+    trial = None if starts else field.with_concealed(events)
     if trial is not None:
-        events, windows = trial
-        fresh, doubtful = search_field(context, windows, events, excess_noise)
+        events = trial
+        fresh, doubtful = field.search(events)
         if fresh:  # what was too faint to be told while its neighbours were not described
-            events = _fit_all(
-                context, windows, [*(e.candidate for e in events), *fresh], events, pool
-            )
-            events, windows = _settled(context, windows, events, pool)
-            _, doubtful = search_field(context, windows, events, excess_noise)
-    # of the threshold: a fit whose final SNR is below it is explained by the others
-    least = 0.95 * context.templates.threshold
-    kept = [e for e in events if e.snr > least and _wanted(context, e)]
+            events = field.settled(field.fit(events, fresh))
+            _, doubtful = field.search(events)
+    kept = field.reported(events)
     while 0 < len(kept) < len(events):  # a dropped fit no longer belongs to the others' background
-        events = _fit_all(context, windows, [e.candidate for e in kept], kept, pool)
-        kept = [e for e in events if e.snr > least and _wanted(context, e)]
+        events = field.fit(kept)
+        kept = field.reported(events)
     lobes: list[Fitted] = []
     if doubtful and not starts:
-        lobes = _fit_all(context, windows, doubtful, kept, pool, first=len(kept))
-        lobes = [e for e in lobes if e.snr > least and _wanted(context, e)]
-    judged = _judged(context, windows, kept, lobes)
+        lobes = field.reported(field.fit_beside(doubtful, kept))
+    judged = field.judged(kept, lobes)
     progress("detect", MAX_ROUNDS, MAX_ROUNDS)
-    return tuple(sorted(judged, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), windows
+    return tuple(sorted(judged, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), field.windows
 
 
-def _large_ones(
-    context: AnalysisContext, windows: Windows, pool: ThreadPoolExecutor
-) -> tuple[list[Fitted], Windows]:
-    """Find spheres before anything else, the brightest first.
+class FieldFit:
+    """Fits of particles in turns; `windows` are the frames, with the power as it is estimated."""
 
-    The search for dipoles would take the rings of their images for particles.  A place is where the
-    light changes most, whatever the shape of the image.
-    """
-    found: list[Fitted] = []
-    dipoles: list[Fitted] = []  # whose rings are no places of their own
-    if not context.spheres_of(context.model):
-        return found, windows
-    nominal = context.model.material.mass_kda
-    shape = (windows.after_e.shape[0], windows.after_e.shape[1])
-    seen: list[tuple[float, float]] = []
-    vain = 0
-    while vain < IN_VAIN:
-        known = [*found, *dipoles]
-        explained = context.left(total_signal(context, shape, known))
-        whole = search_likelihood(context, windows, explained)
-        place = brightest_place(whole, explained, seen, context.roi_px / 4)
-        if place is None:
-            break
-        seen.append(place)
-        vain += 1
-        starts = [Candidate(*place, 0.0, sign * nominal, 0.0) for sign in (1, -1)]
-        either = _fit_all(context, windows, starts, known, pool, first=len(known))
-        best = max(either, key=lambda one: one.fit.log_likelihood, default=None)
-        if best is None:
-            continue
-        if not may_be_large(best.likelihood, best.fit):
-            dipoles.append(best)
-            continue
-        (large,) = with_spheres(context, [best], pool, level=False)
-        if large.sphere:
-            vain = 0
-        if large.sphere or _chi2_left(large) < EXPLAINS * large.snr**2:
-            found, windows = _settled(context, windows, [*found, large], pool)
-    return found, windows
+    def __init__(
+        self,
+        context: AnalysisContext,
+        windows: Windows,
+        excess_noise: ExcessNoise | None,
+        pool: ThreadPoolExecutor,
+    ) -> None:
+        self.windows = windows
+        self._context, self._excess_noise, self._pool = context, excess_noise, pool
 
-
-def _settled(
-    context: AnalysisContext, windows: Windows, events: list[Fitted], pool: ThreadPoolExecutor
-) -> tuple[list[Fitted], Windows]:
-    """Fit all particles in turns, until fits near each other hardly change."""
-    # two fits that share the light of one particle converge slowly
-    for sweep in range(16 if events else 0):
-        last = _without_doubles(events, context)
-        events = _fit_all(context, windows, [e.candidate for e in last], last, pool)
-        windows = _refined(context, windows, events)
-        if sweep + 1 >= _SWEEPS and _is_settled(last, events, context.roi_px / 2):
-            break
-    return events, windows
-
-
-def _with_concealed(
-    context: AnalysisContext,
-    windows: Windows,
-    known: list[Fitted],
-    excess_noise: ExcessNoise | None,
-    pool: ThreadPoolExecutor,
-) -> tuple[list[Fitted], Windows] | None:
-    """Add particles near poor fits, where their absence is the cause of the misfit.
-
-    If several particles are missing around a known one, each by itself explains only a part of the
-    misfit and cannot be told from it.  Candidates are therefore fitted together, and those are kept
-    that explain more than is then left.
-    """
-    trial, power = known, windows
-    for _ in range(MAX_ROUNDS):
-        if not any(Status.POOR_FIT in event.fit.flags for event in trial):
-            break
-        fresh, _ = search_field(
-            # Share of the χ² in excess that a particle explains which is tried among others
-            context,
-            power,
-            trial,
-            excess_noise,
-            explains=0.1,
+    def search(
+        self, events: Sequence[Fitted], explains: float = EXPLAINS
+    ) -> tuple[list[Candidate], list[Candidate]]:
+        """As `search_field`."""
+        return search_field(
+            self._context, self.windows, events, self._excess_noise, explains=explains
         )
-        if not fresh:
-            break
-        both = _fit_all(context, power, [*(e.candidate for e in trial), *fresh], trial, pool)
-        trial = _fit_all(context, power, [e.candidate for e in both], both, pool)
-        power = _refined(context, power, trial)
-    while len(trial) > len(known):
-        trial, power = _settled(context, power, trial, pool)
-        kept = _tenable(context, trial, known)
-        if len(kept) == len(trial):
-            return (trial, power) if len(trial) > len(known) else None
-        trial = kept
-    return None
+
+    def signal(self, events: Sequence[Fitted]) -> FloatArray:
+        """Give the signal of particles over the field."""
+        rows, columns = self.windows.after_e.shape
+        return total_signal(self._context, (rows, columns), events)
+
+    def large_ones(self) -> list[Fitted]:
+        """Find spheres before anything else, the brightest first.
+
+        The search for dipoles would take the rings of their images for particles.  A place is where
+        the light changes most, whatever the shape of the image.
+        """
+        context = self._context
+        found: list[Fitted] = []
+        dipoles: list[Fitted] = []  # whose rings are no places of their own
+        if not context.spheres_of(context.model):
+            return found
+        nominal = context.model.material.mass_kda
+        seen: list[tuple[float, float]] = []
+        vain = 0
+        while vain < IN_VAIN:
+            known = [*found, *dipoles]
+            explained = context.left(self.signal(known))
+            whole = search_likelihood(context, self.windows, explained)
+            place = brightest_place(whole, explained, seen, context.roi_px / 4)
+            if place is None:
+                break
+            seen.append(place)
+            vain += 1
+            starts = [Candidate(*place, 0.0, sign * nominal, 0.0) for sign in (1, -1)]
+            either = self.fit_beside(starts, known)
+            best = max(either, key=lambda one: one.fit.log_likelihood, default=None)
+            if best is None:
+                continue
+            if not may_be_large(best.likelihood, best.fit):
+                dipoles.append(best)
+                continue
+            (large,) = with_spheres(context, [best], self._pool, level=False)
+            if large.sphere:
+                vain = 0
+            if large.sphere or _chi2_left(large) < EXPLAINS * large.snr**2:
+                found = self.settled([*found, large])
+        return found
+
+    def settled(self, events: list[Fitted]) -> list[Fitted]:
+        """Fit all particles in turns, until fits near each other hardly change."""
+        # two fits that share the light of one particle converge slowly
+        for sweep in range(16 if events else 0):
+            last = _without_doubles(events, self._context)
+            events = self.fit(last)
+            self.refine_power(events)
+            if sweep + 1 >= _SWEEPS and _is_settled(last, events, self._context.roi_px / 2):
+                break
+        return events
+
+    def with_concealed(self, known: list[Fitted]) -> list[Fitted] | None:
+        """Add particles near poor fits, where their absence is the cause of the misfit.
+
+        If several particles are missing around a known one, each by itself explains only a part of
+        the misfit and cannot be told from it.  Candidates are therefore fitted together, and those
+        are kept that explain more than is then left.
+        """
+        trial, windows = known, self.windows
+        for _ in range(MAX_ROUNDS):
+            if not any(Status.POOR_FIT in event.fit.flags for event in trial):
+                break
+            # Share of the χ² in excess that a particle explains which is tried among others
+            fresh, _ = self.search(trial, explains=0.1)
+            if not fresh:
+                break
+            trial = self.fit(self.fit(trial, fresh))
+            self.refine_power(trial)
+        while len(trial) > len(known):
+            trial = self.settled(trial)
+            kept = _tenable(self._context, trial, known)
+            if len(kept) == len(trial) > len(known):
+                return trial
+            if len(kept) == len(trial):
+                break
+            trial = kept
+        self.windows = windows
+        return None
+
+    def fit(self, events: Sequence[Fitted], fresh: Sequence[Candidate] = ()) -> list[Fitted]:
+        """Fit all events again, and new candidates, each with all other events beside it."""
+        return self._fit([*(event.candidate for event in events), *fresh], events, 0)
+
+    def fit_beside(self, candidates: Sequence[Candidate], events: Sequence[Fitted]) -> list[Fitted]:
+        """Fit candidates with all events beside them."""
+        return self._fit(candidates, events, len(events))
+
+    def _fit(
+        self, candidates: Sequence[Candidate], events: Sequence[Fitted], first: int
+    ) -> list[Fitted]:
+        """Fit candidates, of which number i replaces event ``first + i``, if there is one."""
+        context, windows = self._context, self.windows
+        nominal = context.model.material.mass_kda
+        free = FREE_PARAMETERS[context.mode]
+        taken: FloatArray | None = None
+        if context.lines is not None:
+            taken = context.lines.taken(self.signal(events))
+
+        starts = [
+            replace(
+                start,
+                mass_kda=start.mass_kda if "mass_kda" in free else nominal,
+                z_nm=start.z_nm if "z_nm" in free else context.height_nm(start.mass_kda),
+            )
+            for start in candidates
+        ]
+        regions = [region_around(context.roi_px, windows.after_e.shape, start) for start in starts]
+        beside = [np.zeros(region.shape) for region in regions]
+
+        def drawn(number: int) -> list[tuple[int, FloatArray]]:
+            """Draw an event in the regions it reaches; its field at its height is made once."""
+            images = []
+            for index, region in enumerate(regions):
+                image = np.zeros(region.shape)
+                if number != first + index:
+                    add_signal(context, events[number].place, region, image, events[number].sphere)
+                if image.any():
+                    images.append((index, image))
+            return images
+
+        for images in self._pool.map(drawn, range(len(events))):
+            for index, image in images:
+                beside[index] += image
+
+        def one(index: int) -> Fitted | None:
+            start, region, others = starts[index], regions[index], beside[index]
+            if taken is not None:
+                others = (1 + others) / taken[region.slices] - 1
+            likelihood = region_likelihood(context, windows, region, others)
+            if likelihood.n_pixels < 0.5 * others.size:
+                return None
+            known = events[first + index] if first + index < len(events) else None
+            if known is not None and known.sphere is not None:
+                seated, again = refitted(likelihood, known.sphere, known.fit, level=False)
+                return Fitted(region, again, seated)
+            likelihood = context.with_prior(likelihood, start.mass_kda)
+            z_range = context.config.fit.z_range_nm
+            fit = fit_particle(likelihood, start, context.mode, z_range, level=False)
+            return Fitted(region, fit, likelihood)
+
+        return [event for event in self._pool.map(one, range(len(candidates))) if event is not None]
+
+    def refine_power(self, events: Sequence[Fitted]) -> None:
+        """Estimate the power again over a background without the particles."""
+        context = self._context
+        if not context.config.background.power_normalization:
+            return
+        signal = context.left(self.signal(events))
+        if context.additive:
+            signal = signal * photons_scale(context, self.windows)
+        self.windows = refine_power(self.windows, signal, additive=context.additive)
+
+    def reported(self, events: Sequence[Fitted]) -> list[Fitted]:
+        """Select fits of the sign that is reported which others do not explain."""
+        # of the threshold: a fit whose final SNR is below it is explained by the others
+        least = 0.95 * self._context.templates.threshold
+        any_sign = self._context.additive or not self._context.config.detection.sign
+        sign = self._context.config.detection.sign
+        return [e for e in events if e.snr > least and (any_sign or sign * e.fit.contrast > 0)]
+
+    def judged(self, fitted: Sequence[Fitted], lobes: Sequence[Fitted]) -> list[Event]:
+        """Add the flags that depend on the neighbourhood: saturation, crowding, side lobes."""
+        judged, context, windows = [], self._context, self.windows
+        limit = context.config.detection.min_separation_nm
+        reach = LARGEST_IMAGE * context.roi_px * context.pixel_nm
+        for number, one in enumerate((*fitted, *lobes)):
+            x, y = one.fit.x_nm, one.fit.y_nm
+            away = [(math.hypot(e.fit.x_nm - x, e.fit.y_nm - y), e) for e in fitted]
+            crowded = any(other is not one and distance < limit for distance, other in away)
+            near = (other.described for distance, other in away if distance < reach)
+            lobe = number >= len(fitted) or one.described.is_dwarfed(near)
+            own = windows.cut(one.region.slices)
+            flags = fit_flags(context, one, own, sidelobe=lobe, too_close=crowded)
+            judged.append(
+                Event(
+                    one.region, one.fit, one.likelihood, own, flags,
+                    windows.frames_after[0], windows.n_before, windows.n_after,
+                )
+            )  # fmt: skip
+        return judged
 
 
 def _tenable(
@@ -329,88 +434,6 @@ def _chi2_left(event: Fitted) -> float:
     return max(0.0, event.fit.chi2_reduced - 1) * event.likelihood.n_pixels
 
 
-def _fit_all(
-    context: AnalysisContext,
-    windows: Windows,
-    candidates: Sequence[Candidate],
-    events: Sequence[Fitted],
-    pool: ThreadPoolExecutor,
-    *,
-    first: int = 0,
-) -> list[Fitted]:
-    """Fit each candidate with all other `events` in its background.
-
-    Candidate i replaces event ``first + i``, if there is one of that number.
-    """
-    nominal = context.model.material.mass_kda
-    free = FREE_PARAMETERS[context.mode]
-    taken: FloatArray | None = None
-    if context.lines is not None:
-        shape = (windows.after_e.shape[0], windows.after_e.shape[1])
-        taken = context.lines.taken(total_signal(context, shape, events))
-
-    starts = [
-        replace(
-            start,
-            mass_kda=start.mass_kda if "mass_kda" in free else nominal,
-            z_nm=start.z_nm if "z_nm" in free else context.height_nm(start.mass_kda),
-        )
-        for start in candidates
-    ]
-    regions = [region_around(context.roi_px, windows.after_e.shape, start) for start in starts]
-    beside = [np.zeros(region.shape) for region in regions]
-
-    def drawn(number: int) -> list[tuple[int, FloatArray]]:
-        """Draw an event in the regions that it reaches; its field at its height is made once."""
-        images = []
-        for index, region in enumerate(regions):
-            image = np.zeros(region.shape)
-            if number != first + index:
-                add_signal(context, events[number].place, region, image, events[number].sphere)
-            if image.any():
-                images.append((index, image))
-        return images
-
-    for images in pool.map(drawn, range(len(events))):
-        for index, image in images:
-            beside[index] += image
-
-    def one(index: int) -> Fitted | None:
-        start, region, others = starts[index], regions[index], beside[index]
-        if taken is not None:
-            others = (1 + others) / taken[region.slices] - 1
-        likelihood = region_likelihood(context, windows, region, others)
-        if likelihood.n_pixels < 0.5 * others.size:
-            return None
-        known = events[first + index] if first + index < len(events) else None
-        if known is not None and known.sphere is not None:
-            seated, again = refitted(likelihood, known.sphere, known.fit, level=False)
-            return Fitted(region, again, seated)
-        likelihood = context.with_prior(likelihood, start.mass_kda)
-        fit = fit_particle(
-            likelihood, start, context.mode, context.config.fit.z_range_nm, level=False
-        )
-        return Fitted(region, fit, likelihood)
-
-    return [event for event in pool.map(one, range(len(candidates))) if event is not None]
-
-
-def _refined(context: AnalysisContext, windows: Windows, events: Sequence[Fitted]) -> Windows:
-    if not context.config.background.power_normalization:
-        return windows
-    shape = (windows.after_e.shape[0], windows.after_e.shape[1])
-    signal = context.left(total_signal(context, shape, events))
-    if context.additive:
-        signal = signal * photons_scale(context, windows)
-    return refine_power(windows, signal, additive=context.additive)
-
-
-def _wanted(context: AnalysisContext, event: Fitted) -> bool:
-    """Whether the fitted contrast has the sign that is reported."""
-    sign = context.config.detection.sign
-    return sign == 0 or context.additive or sign * event.fit.contrast > 0
-
-
 def _is_settled(before: Sequence[Fitted], after: Sequence[Fitted], near_px: float) -> bool:
     """Whether another turn would hardly change fits that are near each other."""
     if len(before) != len(after) or not after:
@@ -436,33 +459,3 @@ def _without_doubles(events: Sequence[Fitted], context: AnalysisContext) -> list
         ):
             kept.append(event)
     return kept
-
-
-def _judged(
-    context: AnalysisContext, windows: Windows, fitted: Sequence[Fitted], lobes: Sequence[Fitted]
-) -> list[Event]:
-    """Add the flags that depend on the neighbourhood: saturation, crowding, side lobes."""
-    judged = []
-    limit = context.config.detection.min_separation_nm
-    for number, one in enumerate((*fitted, *lobes)):
-        x, y = one.fit.x_nm, one.fit.y_nm
-        crowded = any(
-            other is not one and math.hypot(other.fit.x_nm - x, other.fit.y_nm - y) < limit
-            for other in fitted
-        )
-        near = (
-            other.described
-            for other in fitted
-            if math.hypot(other.fit.x_nm - x, other.fit.y_nm - y)
-            < LARGEST_IMAGE * context.roi_px * context.pixel_nm
-        )
-        lobe = number >= len(fitted) or one.described.is_dwarfed(near)
-        own = windows.cut(one.region.slices)
-        flags = fit_flags(context, one, own, sidelobe=lobe, too_close=crowded)
-        judged.append(
-            Event(
-                one.region, one.fit, one.likelihood, own, flags,
-                windows.frames_after[0], windows.n_before, windows.n_after,
-            )
-        )  # fmt: skip
-    return judged

@@ -529,14 +529,11 @@ def three_tests(
     rows = likelihood.derivatives(theta) if derivatives is None else derivatives
     free = np.asarray(free, dtype=np.bool_)
     optics, grid = likelihood.model.optics, likelihood.grid
-    # exact tails of the eight largest residuals
-    rate, tails = np.empty(grid.shape), np.empty((3, 8))
-    chi2, pixels, excess, least_rate, mode_chi2, modes, mode_excess, least, count = count_and_test(
-        likelihood.noise.code, likelihood.data, math.exp(theta[LEVEL]), rows, grid.x_nm, grid.y_nm,
-        theta, WAIST * optics.wavelength_nm / optics.na, ORDER, free, MANY_COUNTS,
-        rate, tails,
-    )  # fmt: skip
-    cells = pixels
+    settings = WAIST * optics.wavelength_nm / optics.na, ORDER, MANY_COUNTS
+    level, place = math.exp(theta[LEVEL]), (grid.x_nm, grid.y_nm, theta)
+    chi2, cells, excess, least_rate, mode_chi2, modes, mode_excess, least, tails, rate = (
+        count_and_test(likelihood.measured, level, rows, place, free, settings)
+    )
     if likelihood.noise.pools_few and least_rate < POOLED_COUNTS:
         residual, kurtosis = _pooled(likelihood, rate)
         chi2, cells, excess = float(residual @ residual), residual.size, float(kurtosis.sum())
@@ -545,8 +542,8 @@ def three_tests(
         return math.nan, (math.nan, math.nan, math.nan)
     above = gamma_above(chi2, freedom, excess / cells)
     structure = gamma_above(mode_chi2, modes, mode_excess) if modes else 1.0
-    if count:
-        least = min(least, 2 * float(likelihood.noise.tails(*tails[:, :count]).min()))
+    if tails.size:
+        least = min(least, 2 * float(likelihood.noise.tails(*tails).min()))
     outlier = likelihood.noise.smallest_tail_probability(rate[likelihood.used], least)
     return chi2 / freedom, (2 * min(above, 1 - above), structure, outlier)
 
@@ -595,14 +592,12 @@ def precision(
     Shapes: `theta` (5,), `fisher` (5, 5), `free` (5,), `derivatives` (ny, ROWS, nx), `walls` (5,),
     `sigma` (4,), `covariance` (n, n), `bias` (5,).
     """
-    n = int(np.count_nonzero(free[:4]))
-    sigma, covariance, bias = np.empty(4), np.empty((n, n)), np.empty(5)
-    moving = free if walls is None else free & ~walls
-    known = errors_and_bias(
-        likelihood.noise.code, likelihood.data, math.exp(theta[LEVEL]), derivatives, fisher, free,
-        moving, slope, likelihood.height_prior[1], sigma, covariance, bias,
-    )  # fmt: skip
-    return known, sigma, covariance, bias
+    moving, units = free if walls is None else free & ~walls, (slope, likelihood.height_prior[1])
+    level = math.exp(theta[LEVEL])
+    found: tuple[bool, FloatArray, FloatArray, FloatArray] = errors_and_bias(
+        likelihood.measured, level, derivatives, fisher, (free, moving), units
+    )
+    return found
 
 
 def reaches_far(likelihood: Likelihood, sigma: FloatArray) -> bool:

@@ -70,7 +70,7 @@ class NoiseLaw(ABC):
         out = np.empty((3, *signal.shape))
         noise.score_of_pixels(self.code, data.reshape(4, -1), level, pixels, out.reshape(3, -1))
         dark = self.used(data) & (self.light(data, signal, level) <= 0)
-        value = -math.inf if dark.any() else signal_value(self.code, data, level, pixels)
+        value = -math.inf if dark.any() else signal_value((self.code, data), level, pixels)
         return PixelTerms(value, *out)
 
     def residuals(self, data: FloatArray, signal: FloatArray, level: float) -> FloatArray:

@@ -23,6 +23,7 @@ import numpy as np
 
 from iscat_analysis._kernels.hessian import observed_information
 from iscat_analysis._kernels.lens import Lens, Pixels
+from iscat_analysis._kernels.noise import Measured
 from iscat_analysis._kernels.radial import AxialTable
 from iscat_analysis._kernels.scoring import (
     CONVERGED,
@@ -221,6 +222,11 @@ class Likelihood(ModelLikelihood):
     prior: HeightPrior | None = None
 
     @property
+    def measured(self) -> Measured:
+        """Noise law and data, as kernels take them."""
+        return self.noise.code, self.data
+
+    @property
     def height_prior(self) -> tuple[float, float]:
         """Mean and information of the prior of z, as kernels take them."""
         return (0.0, 0.0) if self.prior is None else (self.prior.mean_nm, self.prior.information)
@@ -239,10 +245,8 @@ class Likelihood(ModelLikelihood):
             ]
             return out
         known = points if inside.all() else points[inside]
-        values = np.empty(len(known))
         lens, table = self._table(known, pictured=pictured)
-        value_batch(table, lens, *self._arguments[1:], known, values)
-        out[inside] = values
+        out[inside] = value_batch(table, lens, *self._arguments[1:], known)
         out[np.isnan(out)] = -np.inf  # an amplitude so large that the light overflows
         if self.prior is not None:
             out += self.prior.log_density(points[:, 2])
@@ -260,9 +264,9 @@ class Likelihood(ModelLikelihood):
             return super().score_fisher(point)
         score, fisher = np.empty(5), np.empty((5, 5))
         profile = self.model.profile(point[2])
-        value = score_pass(profile, *self._arguments, point, score, fisher)
+        value = score_pass(profile, *self._arguments, point, (score, fisher))
         if self.prior is not None:
-            value += add_prior(self.height_prior, point, score, fisher)
+            value += add_prior(self.height_prior, point, (score, fisher))
         return value, score, fisher
 
     def maximize(
@@ -281,18 +285,17 @@ class Likelihood(ModelLikelihood):
             return super().maximize(start, free, lower, upper, tolerance=tolerance, least=least)
         theta, box = self._checked(start, free, lower, upper)
         free, lower, upper = box.free, box.lower, box.upper
-        fisher = np.empty((5, 5))
-        lens, pixels, kind, data = self._arguments
+        lens, pixels, measured = self._arguments
         if free[2]:
             table = self.model.axial_table
         elif self.is_pictured(theta[2], np.where(free, lower, theta), np.where(free, upper, theta)):
             lens, table = self.model.picture_table(self.grid.pixel_nm, max(self.grid.shape))
         else:
             table = self.model.height_table(theta[2])
-        value, used, outcome = maximize(
-            tuple(table), tuple(lens), tuple(pixels), kind, data, free, lower, upper,
-            self.farthest(np.zeros(5)), tolerance, passes, theta, fisher, least, self.height_prior,
-        )  # fmt: skip
+        search = free, lower, upper, self.farthest(np.zeros(5)), tolerance, passes, least
+        value, used, outcome, fisher = maximize(
+            (tuple(table), tuple(lens), tuple(pixels)), measured, search, self.height_prior, theta
+        )
         return Optimum(theta, value, used, outcome == CONVERGED, fisher)
 
     def scan_heights(
@@ -308,12 +311,10 @@ class Likelihood(ModelLikelihood):
         points[:, 2] = heights
         inside = self.supports(points)
         known = heights if inside.all() else heights[inside]
-        found, refitted = np.empty((2, known.size))
-        lens, pixels, kind, data = self._arguments
-        scan_heights(
-            tuple(self.model.axial_table), tuple(lens), tuple(pixels), kind, data, known,
-            amplitude_range or (0.0, 0.0), point, found, refitted,
-        )  # fmt: skip
+        lens, pixels, measured = self._arguments
+        picture = tuple(self.model.axial_table), tuple(lens), tuple(pixels)
+        limits = amplitude_range or (0.0, 0.0)
+        found, refitted = scan_heights(picture, measured, known, limits, point)
         if self.prior is not None:
             found += self.prior.log_density(known)
         if known is heights:
@@ -335,8 +336,8 @@ class Likelihood(ModelLikelihood):
 
         Shapes: `theta` (5,), result (5, 5).
         """
-        rows, info = self.derivatives(theta), np.empty((5, 5))
-        observed_information(self.noise.code, self.data, math.exp(theta[LEVEL]), rows, info)
+        level, measured = math.exp(theta[LEVEL]), self.measured
+        info: FloatArray = observed_information(measured, level, self.derivatives(theta))
         info[2, 2] += self.height_prior[1]
         return info
 
@@ -367,7 +368,7 @@ class Likelihood(ModelLikelihood):
     ) -> tuple[FloatArray, Box]:
         """Refuse a box that a fit could leave the support in as well."""
         theta, box = super()._checked(start, free, lower, upper)
-        if not box_supported(theta, box.free, box.lower, box.upper, *self._support)[1]:
+        if not box_supported((box.free, box.lower, box.upper), theta, *self._support):
             raise ConfigError(
                 f"lower = {_listed(box.lower)}, upper = {_listed(box.upper)}: {self._supports()}; "
                 "narrow the box or give forward_model a larger reach_nm or z_max_nm"
@@ -406,16 +407,16 @@ class Likelihood(ModelLikelihood):
         return model.lens, model.height_table(fixed)
 
     @cached_property
-    def _support(self) -> tuple[FloatArray, FloatArray, float, float, float, float, float]:
+    def _support(self) -> tuple[tuple[FloatArray, FloatArray, float], tuple[float, ...]]:
         """What `supported` takes after θ."""
         grid, model = self.grid, self.model
-        half = grid.pixel_nm / 2
-        return grid.x_nm, grid.y_nm, half, model.reach_nm, *model.z_range_nm, LARGEST_LEVEL
+        limits = model.reach_nm, *model.z_range_nm, LARGEST_LEVEL
+        return (grid.x_nm, grid.y_nm, grid.pixel_nm / 2), limits
 
     @cached_property
-    def _arguments(self) -> tuple[Lens, Pixels, int, FloatArray]:
+    def _arguments(self) -> tuple[Lens, Pixels, Measured]:
         """What every scoring kernel takes after the profiles."""
-        return self.model.lens, self.model.pixels(self.grid), self.noise.code, self.data
+        return self.model.lens, self.model.pixels(self.grid), self.measured
 
 
 def _listed(theta: FloatArray) -> str:

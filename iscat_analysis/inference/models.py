@@ -62,10 +62,8 @@ class TurningRod:
 
     def signal(self, grid: PixelGrid, values: Values) -> tuple[FloatArray, FloatArray]:
         """Picture and derivatives."""
-        x, y, z, amplitude, azimuth, tilt = map(float, values)
-        there = self.turned(azimuth, tilt)
-        signal, own, angles = there.amplitude_joint_gradient(grid, x, y, z, amplitude, ANGLES)
-        return signal, np.concatenate([own, angles])
+        *place, azimuth, tilt = map(float, values)
+        return self.turned(azimuth, tilt).signal(grid, place, ANGLES)
 
 
 @dataclass(frozen=True)

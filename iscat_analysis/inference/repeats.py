@@ -34,7 +34,7 @@ from scipy.fft import dct
 from scipy.special import ndtri, stdtr, stdtrit
 
 from iscat_analysis._kernels.noise import FLOOR
-from iscat_analysis._kernels.sliding import frame_scores, spreads
+from iscat_analysis._kernels.sliding import frame_scores
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.records import BoolArray, FloatArray
 
@@ -154,11 +154,28 @@ def repeats_of(windows: tuple[Series, ...], longer: tuple[Series, ...] | None = 
     for series in windows:
         frames = series.power.size
         edges = np.linspace(0, frames, min(PARTS, frames) + 1).round().astype(np.int64)
-        spreads(
-            series.values, series.power, series.shot, series.read, edges,
-            np.array(LENGTHS, dtype=np.int64), out,
-        )  # fmt: skip
+        if edges.size > 2:
+            means, variances = _means(series, edges)
+            weight = 1 / variances
+            usual = np.sum(means * weight, axis=1) / weight.sum(axis=1)
+            out[0, :-1] += np.sum(weight * (means - usual[:, None]) ** 2, axis=1)
+            out[0, -1] += edges.size - 2
+        for row, length in zip(out[1:], LENGTHS, strict=True):
+            pairs = frames // (2 * length)
+            if pairs:
+                means, variances = _means(series, length * np.arange(2 * pairs + 1))
+                squares = (means[:, 1::2] - means[:, ::2]) ** 2
+                row[:-1] += np.sum(squares / (variances[:, 1::2] + variances[:, ::2]), axis=1)
+                row[-1] += pairs
     return np.concatenate([out, *spectra])
+
+
+def _means(series: Series, edges: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+    """Means of contiguous frames per unit of power, and their variances, shape (n, parts) each."""
+    sums = np.add.reduceat(series.values[:, : edges[-1]], edges[:-1], axis=1)
+    light = np.add.reduceat(series.power[: edges[-1]], edges[:-1])
+    noise = np.outer(series.shot, light) + np.outer(series.read, np.diff(edges))
+    return sums / light, noise / light**2
 
 
 def spectra_of(repeats: FloatArray) -> FloatArray:

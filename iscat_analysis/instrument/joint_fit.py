@@ -370,17 +370,14 @@ def _scores(
     place = (image.grid, x, y, z, mass)
     k = len(names)
     wanted = tuple(dict.fromkeys(base for name in names for base in image.slopes(name)))
-    if names:
-        signal, own, slopes = model.joint_gradient(*place, wanted)
-    else:
-        signal, own = model.gradient(*place)
+    signal, slopes = model.gradient(*place, wanted)
     rows = np.empty((k + PRIVATE, signal.size))
     for row, name in zip(rows, names, strict=False):
         row[:] = sum(
-            weight * slopes[wanted.index(base)].ravel()
+            weight * slopes[4 + wanted.index(base)].ravel()
             for base, weight in image.slopes(name).items()
         )
-    rows[k : k + LEVEL] = own.reshape(LEVEL, -1)
+    rows[k : k + LEVEL] = slopes[:LEVEL].reshape(LEVEL, -1)
     terms = image.noise.terms(image.data, signal, level)
     rows[-1] = terms.by_level.ravel()
     weighted = rows * terms.information.ravel()

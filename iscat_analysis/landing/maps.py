@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.sliding import add_image, near_earlier_peaks
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.landing.neighbours import Neighbours, Step
 from iscat_analysis.records import FloatArray, Mapper
@@ -79,8 +78,7 @@ class StepMaps:
                 filtered = image, *self.matched.response(step.corner, image)
             _, box, response = filtered
             scale = share * part * math.sqrt(effective[boundary])
-            corner = box[0].start, box[1].start
-            add_image(snr[boundary], corner, response, np.float32(scale))
+            snr[boundary][box] += np.float32(scale) * response
 
     def _anew(self, steps: Sequence[Step], mapper: Mapper) -> tuple[MapArray, FloatArray]:
         """Compute the maps again where the known steps have changed."""
@@ -174,13 +172,18 @@ class SidelobeFilter:
         """
         table = np.array([(p.frame, p.x_px, p.y_px, abs(p.snr)) for p in peaks]).reshape(-1, 4)
         reach, side = STRIDES * self.stride, self.roi_px
-        hidden: list[bool] = near_earlier_peaks(
-            table,
-            (reach, reach + self.stride),
-            (NEAR * side, side, LARGEST_IMAGE * side),
-            (SIDELOBE, FAR_LOBE),
-        ).tolist()
-        return hidden
+        waiting = []
+        for number, (frame, x, y, snr) in enumerate(table.tolist()):
+            higher = table[:number]
+            apart = np.abs(higher[:, 0] - frame)
+            dx, dy = np.abs(higher[:, 1] - x), np.abs(higher[:, 2] - y)
+            away = np.maximum(dx, dy)
+            share = np.where(away < side, SIDELOBE, FAR_LOBE)
+            lobe = (away < LARGEST_IMAGE * side) & (snr < share * higher[:, 3])
+            lobe &= apart <= reach + self.stride
+            same = (apart < reach) & (np.hypot(dx, dy) < NEAR * side)
+            waiting.append(bool((lobe | same).any()))
+        return waiting
 
     def _is_residue(self, step: Step, distance: float, peak: Peak) -> bool:
         """Whether a peak may be the residual of a fitted step, so many pixels away."""

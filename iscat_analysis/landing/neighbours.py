@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.sliding import add_image, times_change
 from iscat_analysis.camera import derivatives
 from iscat_analysis.fitting.context import AnalysisContext, farthest_px
 from iscat_analysis.fitting.events import Region
@@ -276,7 +275,8 @@ class Neighbours:
             return
         shares = self.presence(step, before), self.presence(step, after)
         if shares[0] != shares[1]:
-            times_change(ratio, _ends(here), step.image, _ends(inside), *shares)
+            image = step.image[inside].astype(np.float64)
+            ratio[here] *= (1.0 + shares[1] * image) / (1.0 + shares[0] * image)
 
     def interfere(
         self,
@@ -360,7 +360,8 @@ class Neighbours:
     def add_change(self, total: FloatArray, step: Step, before: slice, after: slice) -> None:
         """Add to a field the contrast that a step's particle makes between ranges of frames."""
         image, share = self.change(step, before, after)
-        add_image(total, step.corner, image, share)
+        (top, left), (rows, columns) = step.corner, image.shape
+        total[top : top + rows, left : left + columns] += share * image
 
     def _present(self, step: Step, frames: slice) -> slice:
         """Select the frames in which the particle is there; all frames if it is in none."""
@@ -437,12 +438,6 @@ class Neighbours:
 def _crossed(one: ComplexArray, two: ComplexArray) -> FloatArray:
     """Light that two fields make together beyond that of each."""
     return np.asarray(2 * np.sum(one * np.conj(two), axis=0).real)
-
-
-def _ends(part: tuple[slice, slice]) -> tuple[int, int, int, int]:
-    """First and last row, first and last column, half-open."""
-    rows, columns = part
-    return rows.start, rows.stop, columns.start, columns.stop
 
 
 def distance_px(one: Step, two: Step) -> float:

@@ -17,7 +17,6 @@ from itertools import compress
 
 import numpy as np
 
-from iscat_analysis._kernels.sliding import strongest_maps
 from iscat_analysis.fitting.context import reported_steps
 from iscat_analysis.fitting.events import fit_flags, standing_out, with_index, with_spheres
 from iscat_analysis.inference.fit import (
@@ -183,8 +182,7 @@ class ChunkFitter:
         context, chunk, matched = self._context, self._chunk, maps.matched
         snr, effective = maps.without(steps, self.mapper)
         if not steps and len(snr):
-            where = np.empty(chunk.shape, dtype=np.int64)
-            strongest_maps(snr, where)
+            where = np.abs(snr).argmax(axis=0)
             best = np.take_along_axis(snr, where[None], axis=0)[0].astype(np.float64)
             frames = np.maximum(effective[where], 1e-9)
             self.strongest[:] = np.abs(best), best / np.sqrt(frames * matched.norm)

@@ -89,18 +89,11 @@ class Aperture:
         inside = self.optics.n_immersion * np.sin(self.pupil.theta) < self.optics.mask_na
         return np.where(inside, self.optics.attenuation, 1.0)
 
-    def path_nm(self, phi: FloatArray) -> FloatArray:
-        """Aberration W [nm], shape (n, phi.size)."""
-        total = np.zeros((self.pupil.theta.size, phi.size))
+    def paths_nm(self, phi: FloatArray) -> FloatArray:
+        """Aberration W and ∂W/∂ρ [nm], shape (2, n, phi.size)."""
+        total = np.zeros((2, self.pupil.theta.size, phi.size))
         for j, size in self.terms:
-            total += size * zernike(j, self.rho[:, None], phi)[0]
-        return total
-
-    def path_slope_nm(self, phi: FloatArray) -> FloatArray:
-        """∂W/∂ρ [nm], shape (n, phi.size)."""
-        total = np.zeros((self.pupil.theta.size, phi.size))
-        for j, size in self.terms:
-            total += size * zernike(j, self.rho[:, None], phi)[1]
+            total += size * np.array(zernike(j, self.rho[:, None], phi))
         return total
 
     def polarised(self, phi: FloatArray) -> ComplexArray:
@@ -153,7 +146,7 @@ class Aperture:
         """
         whole = self.turning(phi, along) if along else self.polarised(phi)
         components = whole[: 1 if self.optics.analyzer else 2]
-        wave: ComplexArray = components * np.exp(1j * self.wavenumber * self.path_nm(phi))
+        wave: ComplexArray = components * np.exp(1j * self.wavenumber * self.paths_nm(phi)[0])
         return wave * self.transmission[:, None] if masked else wave
 
     def azimuths(self) -> FloatArray:

@@ -141,16 +141,12 @@ def with_template(model: ForwardModel, template: Template) -> ForwardModel:
 
 def peak_per_amplitude(model: ForwardModel) -> float:
     """Give the magnitude of the peak contrast of a faint particle, per unit amplitude."""
-    if isinstance(model.wave, MeasuredField):
-        return model.wave.gain
     return abs(signed_peak(model))
 
 
 def signed_peak(model: ForwardModel) -> float:
     """Give the peak contrast of a faint particle, per unit amplitude."""
-    weak = 1e-6 / math.sqrt(collected_area_nm2(model, model.height_nm, 1.0))
-    linear, _ = model.wave.peak(model.height_nm, weak, model.rho)
-    return linear / weak
+    return _peak_terms(model)[0]
 
 
 def _pupil(
@@ -233,7 +229,7 @@ def _refuse_sign(linear: float, line: Calibration, cause: str, otherwise: str) -
 def _peak_terms(model: ForwardModel) -> tuple[float, float]:
     """Give L and Q of the peak contrast L·a + Q·a² of a faint particle of amplitude a."""
     if isinstance(model.wave, MeasuredField):
-        weak = 1e-6 / peak_per_amplitude(model)
+        weak = 1e-6 / model.wave.gain
     else:
         weak = 1e-6 / math.sqrt(collected_area_nm2(model, model.height_nm, 1.0))
     linear, quadratic = model.wave.peak(model.height_nm, weak, model.rho)

@@ -13,7 +13,6 @@ from __future__ import annotations
 import hashlib
 import io
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -22,10 +21,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.lattice import FILTER, LATTICE_STEP, lattice_half, undo_window, window
+from iscat_analysis._kernels.lattice import (
+    BENT,
+    FILTER,
+    LATTICE_STEP,
+    lattice_half,
+    lattice_waves,
+    undo_window,
+    window,
+)
 from iscat_analysis._kernels.lens import LatticeLens
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.last_used import memoize
+from iscat_analysis.last_used import kept
 from iscat_analysis.reading import LARGEST_TEMPLATE_BYTES, npz_of, read_bytes
 
 FloatArray = NDArray[np.float64]
@@ -147,24 +154,15 @@ class MeasuredField:
 
     def profile(self, _z_nm: float, orders: int) -> FloatArray:
         """Profile at any height, shape (2·orders, nodes, nodes)."""
-        return self._profiles(orders)
+        return self._profile(orders)
 
     def profiles(self, heights_nm: FloatArray, _kappa: float) -> FloatArray:
         """Profiles with ∂/∂z and ∂²/∂z², shape (n, 3, channels, width)."""
         one = self.profile(0.0, 3).reshape(1, 3, 2, -1)
         return np.repeat(one, heights_nm.size, axis=0)
 
-    @cached_property
-    def _profiles(self) -> Callable[[int], FloatArray]:
-        def with_orders(orders: int) -> FloatArray:
-            side = 2 * self.half + 1
-            out = np.zeros((2 * orders, side, side))
-            out[0] = self._coefficients()
-            return out
-
-        return memoize(_MOST_LATTICES, with_orders)
-
-    def _coefficients(self) -> FloatArray:
+    @kept(_MOST_LATTICES)
+    def _profile(self, orders: int) -> FloatArray:
         """Sample Re e on a lattice over the reach, and undo the smoothing of its window."""
         side = 2 * (self.half + FILTER) + 1
         samples = np.zeros((side, side))
@@ -173,28 +171,18 @@ class MeasuredField:
         half = min(have, self.half + FILTER)
         inner, there = (slice(c - half, c + half + 1) for c in (self.half + FILTER, have))
         samples[inner, inner] = known[there, there]
-        coefficients: FloatArray = undo_window(samples[None])[0]
-        return coefficients
+        out = np.zeros((2 * orders, 2 * self.half + 1, 2 * self.half + 1))
+        out[:1] = undo_window(samples[None])
+        return out
 
     def components(
         self, dx_nm: FloatArray, dy_nm: FloatArray, _z_nm: float
     ) -> NDArray[np.complex128]:
         """Real field at points, shape (1, *dx_nm.shape)."""
-        plane, step = self._coefficients(), self.template.step_nm
-        dx, dy = np.broadcast_arrays(dx_nm, dy_nm)
-        weights, _ = window()
-        taps = weights.shape[1]
-        out = np.zeros(dx.shape)
-        px, py = (np.clip(d / step + self.half, taps, 2 * self.half - taps) for d in (dx, dy))
-        ix, iy = np.floor(px).astype(int), np.floor(py).astype(int)
-        powers = np.arange(weights.shape[0])
-        wx = ((px - ix)[..., None] ** powers) @ weights
-        wy = ((py - iy)[..., None] ** powers) @ weights
-        for k in range(taps):
-            for m in range(taps):
-                at = plane[ix - taps // 2 + 1 + k, iy - taps // 2 + 1 + m]
-                out += wx[..., k] * wy[..., m] * at
-        return out.astype(np.complex128)[None]
+        dx, dy = (np.ascontiguousarray(d, dtype=float) for d in np.broadcast_arrays(dx_nm, dy_nm))
+        out = np.empty((2 * BENT, dx.size))
+        lattice_waves(self._profile(3), self.lens(1.0), 0, dx.ravel(), dy.ravel(), out)
+        return np.asarray(out[0].reshape(1, *dx.shape), dtype=np.complex128)
 
     def peak(self, _z_nm: float, amplitude: float, rho: float) -> tuple[float, float]:
         """Parts of the signal of largest magnitude that are linear and quadratic in a."""

@@ -26,7 +26,7 @@ q |∇e|².  This is a small part of |e|², which is itself a small part of the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Self, TypeVar
@@ -36,11 +36,13 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels.hessian import PAIRS, ROWS, derivatives_between, signal_hessian
 from iscat_analysis._kernels.image import signal_gradient, signal_image
-from iscat_analysis._kernels.lens import LatticeLens, Lens, Pixels, RoundLens
-from iscat_analysis._kernels.radial import POWERS, AxialTable, profile_between
+from iscat_analysis._kernels.lattice import lattice_values
+from iscat_analysis._kernels.lens import Lens, Pixels, RoundLens
+from iscat_analysis._kernels.radial import AxialTable, profile_at
+from iscat_analysis._kernels.scoring import blank_profile
 from iscat_analysis.config import Optics
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.last_used import memoize
+from iscat_analysis.last_used import kept
 from iscat_analysis.optics.aperture import Aperture
 from iscat_analysis.optics.measured import MeasuredField
 from iscat_analysis.optics.pixels import PixelArea, PixelGrid
@@ -54,7 +56,6 @@ from iscat_analysis.optics.waves import (
     axial_table,
     check_names,
     sensitivity_lattices,
-    signal_derivatives,
 )
 from iscat_analysis.records import FloatArray
 
@@ -196,25 +197,16 @@ class ForwardModel:
         """Profiles at the heights of `z_range_nm`, for the kernels that interpolate along z."""
         return axial_table(self.wave, self.z_range_nm)
 
+    @kept(_TABLES_KEPT)
     def height_table(self, z_nm: float) -> AxialTable:
-        """Profiles at one height, in the form of `axial_table`; the last few are kept."""
-        return self._height_tables(z_nm)
+        """Profiles at one height, in the form of `axial_table`."""
+        return axial_table(self.wave, (z_nm, z_nm))
 
-    @cached_property
-    def _height_tables(self) -> Callable[[float], AxialTable]:
-        return memoize(_TABLES_KEPT, lambda z_nm: axial_table(self.wave, (z_nm, z_nm)))
-
+    @kept(_TABLES_KEPT)
     def picture_table(self, pixel_nm: float, half_px: int) -> tuple[Lens, AxialTable]:
-        """Image at `height_nm` on the grid of the pixels; the last few are kept."""
-        return self._picture_tables(pixel_nm, half_px)
-
-    @cached_property
-    def _picture_tables(self) -> Callable[[float, int], tuple[Lens, AxialTable]]:
-        def of(pixel_nm: float, half_px: int) -> tuple[Lens, AxialTable]:
-            lens, samples = sample_picture(self, pixel_nm, half_px)
-            return lens, AxialTable(samples.reshape(1, 1, 2, -1), self.height_nm, 1.0, 0.0)
-
-        return memoize(_TABLES_KEPT, of)
+        """Image at `height_nm` on the grid of the pixels."""
+        lens, samples = sample_picture(self, pixel_nm, half_px)
+        return lens, AxialTable(samples.reshape(1, 1, 2, -1), self.height_nm, 1.0, 0.0)
 
     def image(
         self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
@@ -236,31 +228,51 @@ class ForwardModel:
         Shapes: result (ny, nx).
         """
         out = np.empty(grid.shape)
-        signal_image(self.profile(z_nm, 1), *self._geometry(grid, x_nm, y_nm, amplitude), out)
+        theta = np.array([x_nm, y_nm, z_nm, amplitude])
+        signal_image(self.profile(z_nm, 1), *self._geometry(grid, theta), theta, out)
         return out
 
     def gradient(
-        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Signal and its analytic derivatives.
-
-        Shapes: `signal` (ny, nx), `gradient` (4, ny, nx).
-        """
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float,
+        names: Sequence[str] = (),
+    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+        """Signal and its analytic derivatives, as `signal` does it, for a mass."""
         amplitude = self.scale.amplitude(mass_kda)
-        signal, gradient = self.signal(grid, (x_nm, y_nm, z_nm, amplitude))
+        signal, gradient = self.signal(grid, (x_nm, y_nm, z_nm, amplitude), names)
         gradient[3] /= self.scale.slope(amplitude)
         return signal, gradient
 
-    def signal(self, grid: PixelGrid, values: Values) -> tuple[FloatArray, FloatArray]:
-        """Signal and its derivatives in `values` = (x, y, z, a), a the amplitude.
+    def signal(
+        self, grid: PixelGrid, values: Values, names: Sequence[str] = ()
+    ) -> tuple[FloatArray, FloatArray]:
+        """Signal and its derivatives in `values` = (x, y, z, a), and in parameters of the optics.
 
-        Shapes: `values` (4,), `signal` (ny, nx), `gradient` (4, ny, nx).
+        a is the amplitude.
+
+        Shapes: `values` (4,), `signal` (ny, nx), `gradient` (4 + len(names), ny, nx).
         """
-        x_nm, y_nm, z_nm, amplitude = map(float, values)
-        rows = np.empty((grid.shape[0], 5, grid.shape[1]))
-        signal_gradient(self.profile(z_nm, 2), *self._geometry(grid, x_nm, y_nm, amplitude), rows)
+        theta = np.array(values, dtype=float)
+        lens, pixels = self._geometry(grid, theta)
+        rows, stack = np.empty((grid.shape[0], 5, grid.shape[1])), None
+        if names:
+            check_names(self.aperture, names)
+            if self.is_measured:
+                raise ConfigError('optics.psf = "measured" knows no parameters of the optics')
+            lens, stack = self._sensitivities(float(theta[2]), tuple(names))
+            profile = stack[:2].reshape(-1, *stack.shape[3:])
+        else:
+            profile = self.profile(float(theta[2]), 2)
+        signal_gradient(profile, lens, pixels, theta, rows)
         out = np.moveaxis(rows, 1, 0)
-        return out[0], out[1:]
+        if stack is None:
+            return out[0], out[1:]
+        slopes, flat = np.empty((len(stack), *grid.shape)), stack.reshape(-1, *stack.shape[3:])
+        lattice_values(flat, lens, pixels, theta, stack.shape[1], slopes)
+        return out[0], np.concatenate([out[1:], slopes[2:]])
+
+    @kept(_TABLES_KEPT)
+    def _sensitivities(self, z_nm: float, names: tuple[str, ...]) -> tuple[Lens, FloatArray]:
+        return sensitivity_lattices(self, z_nm, names)
 
     def amplitude_hessian(
         self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, amplitude: float
@@ -284,69 +296,13 @@ class ForwardModel:
         Shapes: `theta` (4,), result (ny, ROWS, nx).
         """
         rows = np.empty((grid.shape[0], ROWS, grid.shape[1]))
-        x, y, z, amplitude = (float(value) for value in theta[:4])
-        geometry = self._geometry(grid, x, y, amplitude)
+        geometry = self._geometry(grid, theta)
         if height == "between":
-            derivatives_between(self.axial_table, *geometry[:2], theta, rows)
-        elif height == "fixed" and isinstance(self.lens, RoundLens):
-            signal_hessian(self.profile(z, 1), *geometry, rows)
-        else:
-            signal_hessian(self.profile(z, 3), *geometry, rows)
+            derivatives_between(self.axial_table, *geometry, theta, rows)
+            return rows
+        orders = 1 if height == "fixed" and isinstance(self.lens, RoundLens) else 3
+        signal_hessian(self.profile(float(theta[2]), orders), *geometry, theta, rows)
         return rows
-
-    def joint_gradient(
-        self,
-        grid: PixelGrid,
-        x_nm: float,
-        y_nm: float,
-        z_nm: float,
-        mass_kda: float,
-        names: Sequence[str],
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Signal and its analytic derivatives with respect to particle and microscope.
-
-        Shapes: `signal` (ny, nx), `own` (4, ny, nx), `shared` (len(names).
-        """
-        amplitude = self.scale.amplitude(mass_kda)
-        signal, own, shared = self.amplitude_joint_gradient(
-            grid, x_nm, y_nm, z_nm, amplitude, names
-        )
-        own[3] /= self.scale.slope(amplitude)
-        return signal, own, shared
-
-    def amplitude_joint_gradient(
-        self,
-        grid: PixelGrid,
-        x_nm: float,
-        y_nm: float,
-        z_nm: float,
-        amplitude: float,
-        names: Sequence[str],
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Signal and its derivatives for an amplitude instead of a mass, see `amplitude_image`."""
-        check_names(self.aperture, names)
-        if self.is_measured:
-            raise ConfigError('optics.psf = "measured" knows no parameters of the optics')
-        lens, stack = self._sensitivities(z_nm, tuple(names))
-        _, pixels, *_ = self._geometry(grid, x_nm, y_nm, amplitude)
-        rows = np.empty((grid.shape[0], 5, grid.shape[1]))
-        lifted = stack[:2].reshape(-1, *stack.shape[3:])
-        signal_gradient(lifted, lens, pixels, x_nm, y_nm, amplitude, rows)
-        out = np.moveaxis(rows, 1, 0)
-        shared = signal_derivatives(stack, lens, pixels, x_nm, y_nm, amplitude)
-        return out[0], out[1:], shared
-
-    @cached_property
-    def _sensitivities(self) -> Callable[[float, tuple[str, ...]], tuple[LatticeLens, FloatArray]]:
-        def at(z_nm: float, names: tuple[str, ...]) -> tuple[LatticeLens, FloatArray]:
-            return sensitivity_lattices(
-                self.aperture,
-                self.factor,
-                self.oil_nm,
-                z_nm, names, rho=self.rho, reach_nm=self.reach_nm,
-            )  # fmt: skip
-
-        return memoize(_TABLES_KEPT, at)
 
     def field(
         self, dx_nm: FloatArray, dy_nm: FloatArray, z_nm: float, mass_kda: float
@@ -366,27 +322,20 @@ class ForwardModel:
         """Peak contrast of an amplitude; see `peak_contrast` and `amplitude_image`."""
         if height == "exact" or isinstance(self.wave, MeasuredField):
             return sum(self.wave.peak(z_nm, amplitude, self.rho))
-        if isinstance(self.wave, RadialField):
-            profile = np.empty((self.wave.table.shape[3] - 1, POWERS, 4))
-        else:
-            nodes = 2 * self.wave.half + 1
-            profile = np.empty((3 * self.axial_table.heights.shape[2], nodes, nodes))
-        profile_between(self.axial_table, z_nm, profile)
+        table, orders = self.axial_table, 1 if isinstance(self.wave, RadialField) else 3
+        profile = blank_profile(table, self.lens, orders)
+        profile_at(table, z_nm, 0, table.heights.shape[3], profile)
         return sum(self.wave.peak(z_nm, amplitude, self.rho, profile))
 
-    def _geometry(
-        self, grid: PixelGrid, x_nm: float, y_nm: float, amplitude: float
-    ) -> tuple[Lens, Pixels, float, float, float]:
-        """Arguments every image kernel takes after the profile."""
-        half = grid.pixel_nm / 2
-        far_x = max(abs(grid.x_nm[0] - x_nm), abs(grid.x_nm[-1] - x_nm)) + half
-        far_y = max(abs(grid.y_nm[0] - y_nm), abs(grid.y_nm[-1] - y_nm)) + half
-        if math.hypot(far_x, far_y) > self.reach_nm:
+    def _geometry(self, grid: PixelGrid, theta: FloatArray) -> tuple[Lens, Pixels]:
+        """Give what every image kernel takes between profile and θ, unless θ is too far away."""
+        far_nm = grid.farthest_nm(float(theta[0]), float(theta[1]))
+        if far_nm > self.reach_nm:
             raise ConfigError(
-                f"the grid extends {math.hypot(far_x, far_y):.0f} nm from the particle, the model "
+                f"the grid extends {far_nm:.0f} nm from the particle, the model "
                 f"was built for {self.reach_nm:.0f} nm: give forward_model a larger reach_nm"
             )
-        return self.lens, self.pixels(grid), x_nm, y_nm, amplitude
+        return self.lens, self.pixels(grid)
 
 
 def collected_area_nm2(model: ForwardModel, z_nm: float, mass_kda: float) -> float:
@@ -421,15 +370,12 @@ def signals_within(model: ForwardModel, grid: PixelGrid, theta: FloatArray) -> F
 
     Shapes: `theta` (n, 4), result (n, ny, nx).
     """
-    far_x, far_y = (
-        np.maximum(np.abs(axis[0] - place), np.abs(axis[-1] - place)) + grid.pixel_nm / 2
-        for axis, place in ((grid.x_nm, theta[:, 0]), (grid.y_nm, theta[:, 1]))
-    )
-    near = np.flatnonzero(np.hypot(far_x, far_y) <= model.reach_nm)
     out = np.zeros((len(theta), *grid.shape))
     lens, pixels = model.lens, model.pixels(grid)
-    for number, (x, y, z, amplitude) in zip(near.tolist(), theta[near].tolist(), strict=True):
-        signal_image(model.profile(z, 1), lens, pixels, x, y, amplitude, out[number])
+    for own, signal in zip(theta, out, strict=True):
+        x, y, z = own[:3].tolist()
+        if grid.farthest_nm(x, y) <= model.reach_nm:
+            signal_image(model.profile(z, 1), lens, pixels, own, signal)
     return out
 
 

@@ -77,6 +77,12 @@ class PixelGrid:
         """Rows, columns."""
         return self.y_nm.size, self.x_nm.size
 
+    def farthest_nm(self, x_nm: float, y_nm: float) -> float:
+        """Largest distance of a place from the grid's pixels, their edges included [nm]."""
+        far_x = max(abs(self.x_nm[0] - x_nm), abs(self.x_nm[-1] - x_nm))
+        far_y = max(abs(self.y_nm[0] - y_nm), abs(self.y_nm[-1] - y_nm))
+        return math.hypot(far_x + self.pixel_nm / 2, far_y + self.pixel_nm / 2)
+
     @property
     def diagonal_nm(self) -> float:
         """Largest distance inside the grid, pixel edges included [nm]."""

@@ -72,9 +72,13 @@ class MassScale:
         """Contrast per kDa at the model's own optics over that at the optics of the standards."""
         return 1.0 if self.here is None else self.here / self.linear
 
+    def peak(self, amplitude: FloatArray) -> FloatArray:
+        """Contrast of amplitudes of any shape at the optics of the standards."""
+        return self.linear * amplitude + self.quadratic * amplitude**2
+
     def amplitude(self, mass_kda: float) -> float:
         """Amplitude a of a particle of a given mass [kDa]."""
-        return mass_kda if self.calibration is None else float(self.amplitudes(mass_kda))
+        return float(self.amplitudes(mass_kda))
 
     def amplitudes(self, mass_kda: ArrayLike) -> FloatArray:
         """`amplitude` of masses of any shape."""
@@ -92,16 +96,13 @@ class MassScale:
         if self.calibration is None:
             return amplitude
         line = self.calibration
-        contrast = self.linear * amplitude + self.quadratic * amplitude**2
+        contrast = self.peak(amplitude)
         sign = np.sign(contrast * line.gradient_per_kda)
         return (contrast - sign * line.offset) / line.gradient_per_kda
 
     def slope(self, amplitude: float) -> float:
         """Return dm/da [kDa per unit amplitude]."""
-        if self.calibration is None:
-            return 1.0
-        rise = self.linear + 2 * self.quadratic * amplitude
-        return rise / self.calibration.gradient_per_kda
+        return float(self.slopes(np.asarray(amplitude)))
 
     def bend(self, mass_kda: FloatArray) -> FloatArray:
         """Give the relative error of a line of faint standards for heavy particles.
@@ -131,8 +132,7 @@ class MassScale:
         if self.calibration is None or self.calibration.offset == 0.0:
             return np.zeros(amplitude.shape, dtype=np.bool_)
         line = self.calibration
-        contrast = self.linear * amplitude + self.quadratic * amplitude**2
-        size = np.abs(contrast / line.gradient_per_kda)
+        size = np.abs(self.peak(amplitude) / line.gradient_per_kda)
         crossing = -line.offset / line.gradient_per_kda
         if crossing > 0:
             return (size < crossing + errors * sigma_kda) & (2 * crossing > sigma_kda)

@@ -19,9 +19,8 @@ The parameter z of these models is the gap between the sphere and the coverslip.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -30,7 +29,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.hessian import PAIRS
 from iscat_analysis.config import Optics, Particle, SphereKind
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.last_used import memoize
+from iscat_analysis.last_used import kept
 from iscat_analysis.optics.aperture import aperture_on
 from iscat_analysis.optics.model import ForwardModel, Values
 from iscat_analysis.optics.pixels import PixelGrid
@@ -66,34 +65,20 @@ class SizedModel(ForwardModel):
         """Whether particles are spheres, whose picture changes its shape with their size."""
         return True
 
+    @kept(48)
     def at(self, amplitude: float) -> ForwardModel:
         """Give the model whose pictures grow in proportion to the amplitude near this one."""
-        return self._of_mass(self.sphere.of_mass(amplitude))
+        return self._linear(self.sphere.of_mass(amplitude))
 
+    @kept(64)
     def scanned(self, amplitude: float) -> ForwardModel:
         """Give `at`, kept with its table along z apart from the masses that a fit passes by."""
-        return self._of_scan(self.sphere.of_mass(amplitude))
+        return self._linear(self.sphere.of_mass(amplitude))
 
+    @kept(6)
     def of_index(self, index: float) -> SizedModel:
         """Give the model of spheres, or of cores in the same shell, of another index."""
-        return self._of_index(index)
-
-    @cached_property
-    def _of_index(self) -> Callable[[float], SizedModel]:
-        def make(index: float) -> SizedModel:
-            return replace(self, sphere=replace(self.sphere, index=complex(index)))
-
-        return memoize(6, make)
-
-    @cached_property
-    def _of_mass(self) -> Callable[[Sphere], ForwardModel]:
-        # single masses at hand
-        return memoize(48, self._linear)
-
-    @cached_property
-    def _of_scan(self) -> Callable[[Sphere], ForwardModel]:
-        # masses of a scan, with tables along z of some MB each
-        return memoize(64, self._linear)
+        return replace(self, sphere=replace(self.sphere, index=complex(index)))
 
     def _linear(self, sphere: Sphere) -> ForwardModel:
         """Make the model of the pattern of one sphere."""
@@ -117,12 +102,18 @@ class SizedModel(ForwardModel):
         """As `ForwardModel.amplitude_image`."""
         return self.at(amplitude).amplitude_image(grid, x_nm, y_nm, z_nm, amplitude)
 
-    def signal(self, grid: PixelGrid, values: Values) -> tuple[FloatArray, FloatArray]:
+    def signal(
+        self, grid: PixelGrid, values: Values, names: Sequence[str] = ()
+    ) -> tuple[FloatArray, FloatArray]:
         """As `ForwardModel.signal`."""
-        x_nm, y_nm, z_nm, amplitude = map(float, values)
-        signal, own = self.at(amplitude).signal(grid, values)
-        own[3] = self._along_mass(grid, x_nm, y_nm, z_nm, amplitude)
-        return signal, own
+        x, y, z, amplitude = map(float, values)
+        signal, gradient = self.at(amplitude).signal(grid, values, names)
+        step = self.step_of(amplitude)
+        below, above = (
+            self.amplitude_image(grid, x, y, z, a) for a in (amplitude - step, amplitude + step)
+        )
+        gradient[3] = (above - below) / (2 * step)
+        return signal, gradient
 
     def derivative_rows(
         self, grid: PixelGrid, theta: FloatArray, height: str = "exact"
@@ -141,21 +132,6 @@ class SizedModel(ForwardModel):
         rows[:, _SECOND[3, 3]] = (above[:, 0] - 2 * rows[:, 0] + below[:, 0]) / step**2
         return rows
 
-    def amplitude_joint_gradient(
-        self,
-        grid: PixelGrid,
-        x_nm: float,
-        y_nm: float,
-        z_nm: float,
-        amplitude: float,
-        names: Sequence[str],
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """As `ForwardModel.amplitude_joint_gradient`."""
-        place = (grid, x_nm, y_nm, z_nm, amplitude)
-        signal, own, shared = self.at(amplitude).amplitude_joint_gradient(*place, names)
-        own[3] = self._along_mass(*place)
-        return signal, own, shared
-
     def field(
         self, dx_nm: FloatArray, dy_nm: FloatArray, z_nm: float, mass_kda: float
     ) -> ComplexArray:
@@ -166,17 +142,6 @@ class SizedModel(ForwardModel):
         """As `ForwardModel.amplitude_contrast`; no mass has a table along z."""
         del height
         return self.at(amplitude).amplitude_contrast(z_nm, amplitude)
-
-    def _along_mass(
-        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, amplitude: float
-    ) -> FloatArray:
-        """Differentiate the signal along the mass."""
-        step = self.step_of(amplitude)
-        below, above = (
-            self.amplitude_image(grid, x_nm, y_nm, z_nm, a)
-            for a in (amplitude - step, amplitude + step)
-        )
-        return np.asarray((above - below) / (2 * step))
 
 
 def sized(model: ForwardModel, sphere: Sphere, diameters_nm: tuple[float, float]) -> SizedModel:

@@ -72,7 +72,7 @@ def sample_picture(
         pixels = Pixels(nodes[inside], np.array([y]), offsets, weights)
         for k, sign in enumerate((1.0, -1.0)):
             out = np.empty((1, inside.size))
-            signal_image(profile, model.lens, pixels, 0.0, 0.0, sign * z, out)
+            signal_image(profile, model.lens, pixels, np.array([0.0, 0.0, 0.0, sign * z]), out)
             both[k, row, inside] = out[0]
     up, down = both
     samples = np.stack([(up - down) / (2 * z), (up + down) / (2 * z**2)])

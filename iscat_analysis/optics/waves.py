@@ -14,10 +14,10 @@ pixels.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,6 @@ from iscat_analysis._kernels.lattice import (
     FILTER,
     LATTICE_STEP,
     lattice_half,
-    lattice_values,
     radial_waves,
     reach_of_samples,
     sampled,
@@ -42,7 +41,7 @@ from iscat_analysis._kernels.radial import POWERS, STEP, AxialTable, bessel_tabl
 from iscat_analysis._kernels.radial_rows import largest_signal
 from iscat_analysis.config import MEASURABLE, Optics
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.last_used import LastUsed, memoize
+from iscat_analysis.last_used import LastUsed, kept
 from iscat_analysis.optics.aperture import (
     Aperture,
     Cone,
@@ -60,6 +59,9 @@ from iscat_analysis.optics.aperture import (
 from iscat_analysis.optics.measured import MeasuredField
 from iscat_analysis.optics.scatterers import ANGLES, Rod
 from iscat_analysis.records import FloatArray
+
+if TYPE_CHECKING:
+    from iscat_analysis.optics.model import ForwardModel
 
 ComplexArray = NDArray[np.complex128]
 
@@ -118,13 +120,10 @@ class RadialField:
             linear, linear * seen, (1 - linear) * seen,
         )  # fmt: skip
 
+    @kept(_HEIGHTS_KEPT)
     def profile(self, z_nm: float, orders: int) -> FloatArray:
-        """Profile at a height, shape (intervals, 6, 4·orders); the last few are kept."""
-        return self._profiles(z_nm, orders)
-
-    @cached_property
-    def _profiles(self) -> Callable[[float, int], FloatArray]:
-        return memoize(_HEIGHTS_KEPT, lambda z, orders: self._profile(z, orders, 0.0))
+        """Profile at a height, shape (intervals, 6, 4·orders)."""
+        return self._profile(z_nm, orders, 0.0)
 
     def _profile(self, z_nm: float, orders: int, kappa: float) -> FloatArray:
         points = self.table.shape[3]
@@ -156,7 +155,7 @@ class RadialField:
         if profile is None:
             profile = self.profile(z_nm, 1)
         parts: tuple[float, float] = largest_signal(
-            profile, 1 / self.step_nm, _PEAK_POINTS, amplitude, rho, self.circular, self.analyzer
+            profile, self.lens(rho), _PEAK_POINTS, amplitude
         )
         return parts
 
@@ -210,18 +209,12 @@ class LatticeField:
         """How the kernels make a signal of a profile, with the reference ρ."""
         return LatticeLens(1 / self.step_nm, rho, self.half, self.count, window()[0])
 
+    @kept(_HEIGHTS_KEPT)
     def profile(self, z_nm: float, orders: int) -> FloatArray:
-        """Profile at a height, shape (channels, nodes, nodes); the last few are kept."""
-        return self._profiles(z_nm, orders)
-
-    @cached_property
-    def _profiles(self) -> Callable[[float, int], FloatArray]:
-        def at(z_nm: float, orders: int) -> FloatArray:
-            side = 2 * self.half + 1
-            check_table("the field around a particle", orders * self.width)
-            return self._stack(np.array([z_nm]), orders, 0.0).reshape(-1, side, side)
-
-        return memoize(_HEIGHTS_KEPT, at)
+        """Profile at a height, shape (channels, nodes, nodes)."""
+        side = 2 * self.half + 1
+        check_table("the field around a particle", orders * self.width)
+        return self._stack(np.array([z_nm]), orders, 0.0).reshape(-1, side, side)
 
     def profiles(self, heights_nm: FloatArray, kappa: float) -> FloatArray:
         """Profiles with ∂/∂z and ∂²/∂z² without exp(iκz), shape (n, 3, channels, width)."""
@@ -273,53 +266,41 @@ class LatticeField:
         parts = self.cone.added(out.transpose(2, 1, 0)[None], dx, dy)[0]
         return np.asarray(parts[:, 0] + 1j * parts[:, 1]).reshape(-1, *np.shape(dx_nm))
 
-    @cached_property
-    def _waves_at(self) -> Callable[[float], FloatArray]:
-        def at(z_nm: float) -> FloatArray:
-            weights = self._weights(np.array([z_nm]), 1, 0.0)[0, 0]
-            return self._waves(weights, self.transverse, self.radial_step_nm)
-
-        return memoize(_HEIGHTS_KEPT, at)
+    @kept(_HEIGHTS_KEPT)
+    def _waves_at(self, z_nm: float) -> FloatArray:
+        weights = self._weights(np.array([z_nm]), 1, 0.0)[0, 0]
+        return self._waves(weights, self.transverse, self.radial_step_nm)
 
     def peak(
         self, z_nm: float, amplitude: float, rho: float, profile: FloatArray | None = None
     ) -> tuple[float, float]:
         """Parts of the signal of largest magnitude that are linear and quadratic in a.
 
-        The largest signal on a fine grid is the start of Newton's method; from a profile at that
-        height if one is given, else exactly.
+        The largest signal on a fine grid is the start of Newton's method.
         """
-        exact = profile is None
+        grid = self._grid
         if profile is None:
             profile = self.profile(z_nm, 3)
             along, power = self._plane(z_nm)
         else:
-            along, power = self._parts(profile, self._grid)
-        grid = self._grid
+            along, power = self._parts(profile, grid)
         signal = 2 * rho * amplitude * along + amplitude**2 * power
         row, column = np.unravel_index(np.argmax(np.abs(signal)), signal.shape)
         x, y = float(grid.x[column]), float(grid.y[row])
         lens, step = self.lens(rho), float(grid.x[1] - grid.x[0])
-        point, one = np.zeros(1), np.ones(1)
+        point, one, theta = np.zeros(1), np.ones(1), np.array([0.0, 0.0, z_nm, amplitude])
         out = np.empty((1, ROWS, 1))
         if 0 < row < grid.y.size - 1 and 0 < column < grid.x.size - 1:
             # Newton's steps
             for _ in range(4):
                 pixels = Pixels(np.array([x]), np.array([y]), point, one)
-                signal_hessian(profile, lens, pixels, 0.0, 0.0, amplitude, out)
+                signal_hessian(profile, lens, pixels, theta, out)
                 # the particle's derivatives: those of the camera's position with the sign changed
                 _, s_x, s_y, _, _, s_xx, s_xy, s_yy = out[0, :8, 0]
                 move = np.linalg.solve([[s_xx, s_xy], [s_xy, s_yy]], [s_x, s_y])
-                x, y = (
-                    x + float(np.clip(move[0], -step, step)),
-                    y + float(np.clip(move[1], -step, step)),
-                )
-        if exact:
-            field = self.components(np.array([x]), np.array([y]), z_nm)[:, 0]
-            re, square = float(field[0].real), float(np.sum(np.abs(field) ** 2))
-        else:
-            at_top = self._parts(profile, Pixels(np.array([x]), np.array([y]), point, one))
-            re, square = (float(part[0, 0]) for part in at_top)
+                x, y = (np.array([x, y]) + np.clip(move, -step, step)).tolist()
+        at_top = self._parts(profile, Pixels(np.array([x]), np.array([y]), point, one))
+        re, square = (float(part[0, 0]) for part in at_top)
         return 2 * rho * amplitude * re, amplitude**2 * square
 
     @cached_property
@@ -329,15 +310,15 @@ class LatticeField:
         axis = self.step_nm * _PEAK_STEP * np.arange(-half, half + 1, dtype=np.float64)
         return Pixels(axis, axis, np.zeros(1), np.ones(1))
 
-    @cached_property
-    def _plane(self) -> Callable[[float], tuple[FloatArray, FloatArray]]:
-        return memoize(_HEIGHTS_KEPT, lambda z_nm: self._parts(self.profile(z_nm, 3), self._grid))
+    @kept(_HEIGHTS_KEPT)
+    def _plane(self, z_nm: float) -> tuple[FloatArray, FloatArray]:
+        return self._parts(self.profile(z_nm, 3), self._grid)
 
     def _parts(self, profile: FloatArray, pixels: Pixels) -> tuple[FloatArray, FloatArray]:
         """Re e_u and |e|² at points, from a profile."""
         above, below = np.empty((2, pixels.y.size, pixels.x.size))
         for sign, out in ((1.0, above), (-1.0, below)):
-            signal_image(profile, self.lens(1.0), pixels, 0.0, 0.0, sign, out)
+            signal_image(profile, self.lens(1.0), pixels, np.array([0.0, 0.0, 0.0, sign]), out)
         return (above - below) / 4, (above + below) / 2
 
 
@@ -400,7 +381,7 @@ def _source(opening: Aperture, factor: complex, oil_nm: float) -> tuple[ComplexA
     """Light of a round pupil in the sums of F0 and F2, and its phase per height."""
     pupil = opening.pupil
     weight, axial = weight_on(opening, factor, oil_nm)
-    turn = np.exp(1j * opening.wavenumber * opening.path_nm(np.zeros(1))[:, 0])
+    turn = np.exp(1j * opening.wavenumber * opening.paths_nm(np.zeros(1))[0, :, 0])
     common = weight / 2 * turn * opening.transmission
     source = np.stack([common * (pupil.t_s + pupil.t_p_cos), common * (pupil.t_s - pupil.t_p_cos)])
     return _in_fours(source), _in_fours(axial, "edge")
@@ -446,60 +427,39 @@ def check_names(opening: Aperture, names: Sequence[str]) -> None:
 
 
 def sensitivity_lattices(
-    opening: Aperture,
-    factor: complex,
-    oil_nm: float,
-    z_nm: float,
-    names: tuple[str, ...],
-    *,
-    rho: float,
-    reach_nm: float,
+    model: ForwardModel, z_nm: float, names: tuple[str, ...]
 ) -> tuple[LatticeLens, FloatArray]:
-    """Lattices of the field and of its derivatives at one height.
+    """Lattices of the field, and of its derivatives along z and parameters of the optics.
 
-    Shapes: `stack` (2 + len(names).
+    Shapes: `stack` (2 + len(names), components, 2, nodes, nodes).
     """
-    optics, phi = opening.optics, opening.azimuths()
-    light = over_spectrum(
-        [
-            _changes(opening, each, factor_at(factor, each, optics), oil_nm, z_nm, names, rho, phi)
-            for each in spectrum(optics)
-        ]
-    )
+    optics, phi = model.optics, model.aperture.azimuths()
+    light = over_spectrum([_changes(model, each, z_nm, names, phi) for each in spectrum(optics)])
     waves = light.waves.reshape(-1, *light.waves.shape[2:])
     # Share of the change of light below which its azimuthal harmonics are left out
     series = harmonics(waves, np.abs(light.weight), 1e-6) * light.weight
-    count = light.waves.shape[1]
-    lattice = LatticeField(
-        series[:count], light.axial, light.transverse, band_of(optics), reach_nm, cone_of(optics)
-    )
+    count, band, cone = light.waves.shape[1], band_of(optics), cone_of(optics)
+    first = series[:count]
+    lattice = LatticeField(first, light.axial, light.transverse, band, model.reach_nm, cone)
     # Radial step of these tables over that of the field: their error is one part in 10⁶
     stack = lattice.lattices(series, light.transverse, 2)
-    whole = stack.reshape(2 + len(names), lattice.count, *stack.shape[1:])
-    return lattice.lens(rho), whole
+    return lattice.lens(model.rho), stack.reshape(2 + len(names), lattice.count, *stack.shape[1:])
 
 
 def _changes(
-    opening: Aperture,
-    optics: Optics,
-    factor: complex,
-    oil_nm: float,
-    z_nm: float,
-    names: tuple[str, ...],
-    rho: float,
-    phi: FloatArray,
+    model: ForwardModel, optics: Optics, z_nm: float, names: tuple[str, ...], phi: FloatArray
 ) -> Ray:
     """Light of one wavelength in the pupil, how it rises with the height, and its derivatives."""
+    opening, rho = model.aperture, model.rho
     rim, edge = (math.asin(na / optics.n_immersion) for na in (optics.na, optics.mask_na))
     # two more directions, with zero weight except where an edge moves
     theta = np.concatenate([opening.pupil.theta, [rim, edge]])
     weights = np.concatenate([opening.pupil.weight, [1.0, 1.0]])
     whole = aperture_on(optics, theta, weights, opening.scatterer)
-    weight, axial = weight_on(whole, factor, oil_nm)
+    weight, axial = weight_on(whole, factor_at(model.factor, optics, model.optics), model.oil_nm)
     weight = weight * np.exp(1j * axial * z_nm)
-    inner = np.ones(theta.size)
+    inner, at_rim, at_edge = np.ones(theta.size), np.zeros(theta.size), np.zeros(theta.size)
     inner[-2:] = 0.0
-    at_rim, at_edge = np.zeros(theta.size), np.zeros(theta.size)
     at_rim[-2] = 1 / (optics.n_immersion * math.cos(rim))
     at_edge[-1] = 1 / (optics.n_immersion * math.cos(edge)) if optics.mask_na else 0.0
     k = whole.wavenumber
@@ -511,7 +471,7 @@ def _changes(
         if name == "focus_nm":
             return field * (-1j * whole.pupil.oil[:, None])
         if name == "na":
-            stretch = -1j * k / optics.na * whole.rho[:, None] * whole.path_slope_nm(phi)
+            stretch = -1j * k / optics.na * whole.rho[:, None] * whole.paths_nm(phi)[1]
             return field * (stretch + _log_efficiency_slope(optics)) + seen * at_rim[:, None]
         if name == "reference_phase_deg":
             return field * (-1j * math.pi / 180 * rho)
@@ -535,17 +495,3 @@ def _log_efficiency_slope(optics: Optics) -> float:
         return 0.0
     sine = optics.na / optics.n_sample
     return 1 / (optics.n_sample * math.sqrt(1 - sine**2) * math.asin(sine))
-
-
-def signal_derivatives(
-    stack: FloatArray, lens: LatticeLens, pixels: Pixels, x_nm: float, y_nm: float, amplitude: float
-) -> FloatArray:
-    """Combine lattices to derivatives of the signal.
-
-    Shapes: `stack` (2 + n, components, 2, nodes, nodes), result (n, ny, nx).
-    """
-    count, components = stack.shape[:2]
-    out = np.empty((count, pixels.y.size, pixels.x.size))
-    flat = stack.reshape(count * components * 2, *stack.shape[3:])
-    lattice_values(flat, lens, pixels, x_nm, y_nm, amplitude, components, out)
-    return out[2:]

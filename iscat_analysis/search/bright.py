@@ -25,7 +25,6 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from iscat_analysis._kernels.sliding import step_energy
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
 from iscat_analysis.search.dating import locate_step
 from iscat_analysis.search.frames import Chunk
@@ -152,18 +151,21 @@ def _spots(
     side = max(1, int(spot_px / 2.0))
     cells = math.ceil(chunk.shape[0] / side), math.ceil(chunk.shape[1] / side)
     energy = np.zeros((count, *cells), dtype=np.float32)
-    still = np.empty((0, 0), dtype=np.float32)
 
     def one(j: int) -> None:
         low, middle, high = max(j + 1 - STRIDES, 0), j + 1, min(j + 1 + STRIDES, count + 1)
         ratio = power[middle:high].sum() / max(power[low:middle].sum(), 1e-300)
         if not 0 < ratio < 1e6:
             return
-        excess, share = np.empty((2, *cells), dtype=np.float32)
-        before, after = chunk.blocks_e[low:middle], chunk.blocks_e[middle:high]
+        before = chunk.blocks_e[low:middle].sum(axis=0)
+        after = chunk.blocks_e[middle:high].sum(axis=0)
+        lit = chunk.usable & (before > 0) & (after > 0)
+        if moved is not None:
+            before *= 1 + moved[j]
         noise = read * (frames[middle:high].sum() + ratio**2 * frames[low:middle].sum())
-        change = still if moved is None else moved[j]
-        step_energy(before, after, change, chunk.usable, noise, ratio, side, excess, share)
+        level = after.sum(where=lit, dtype=float) / before.sum(where=lit, dtype=float)
+        change, variance = after - np.float32(level) * before, after + ratio**2 * before + noise
+        excess, share = excess_of(change, variance, lit, side)
         energy[j] = _smoothed_energy(excess, share, spot_px / side, spot_px)
 
     list(mapper(one, range(count)))
@@ -180,10 +182,27 @@ def energy_of(
 
     Shapes: `change, variance` (y, x), `used` (y, x), result (y, x).
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        excess = (np.square(change) / variance - 1).astype(np.float32)
+    return _smoothed_energy(*excess_of(change, variance, used), spot_px, spot_px)
+
+
+def excess_of(
+    change: NDArray[np.floating], variance: FloatArray, used: BoolArray, side: int = 1
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Squared change over its variance, less one, and share of used pixels, in squares of pixels.
+
+    Shapes: `change, variance, used` (y, x), results (y/side, x/side).
+    """
+    excess = np.square(change, dtype=np.float32)
+    np.divide(excess, variance, where=used, out=excess, casting="same_kind")
+    excess -= 1
     excess[~used] = 0.0
-    return _smoothed_energy(excess, used.astype(np.float32), spot_px, spot_px)
+    both = np.stack([excess, used])
+    if side > 1:
+        edges = [np.arange(0, size, side) for size in change.shape]
+        both = np.add.reduceat(np.add.reduceat(both, edges[0], axis=1), edges[1], axis=2)
+        sides = (np.diff(at, append=n) for at, n in zip(edges, change.shape, strict=True))
+        both /= np.multiply.outer(*sides).astype(np.float32)
+    return both[0], both[1]
 
 
 def _smoothed_energy(

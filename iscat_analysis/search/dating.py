@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import erfc, logsumexp
 
-from iscat_analysis._kernels.sliding import best_line, frame_scores, one_change, projector
+from iscat_analysis._kernels.sliding import best_line, frame_scores
 from iscat_analysis.records import FloatArray, IntArray
 from iscat_analysis.search.frames import Patch
 
@@ -235,8 +235,7 @@ def locate_step(
     heights, weight, scale = frame_heights(patch, image)
     if known is not None:
         heights = heights - known
-    jump, gain_in_log = np.empty((2, max(heights.size - 1, 0)))
-    one_change(heights, weight, jump, gain_in_log)
+    jump, gain_in_log = _changes(heights, weight)
     frames = np.arange(patch.first + 1, patch.first + heights.size)
     inside = (frames >= search[0]) & (frames < search[1]) & np.isfinite(gain_in_log)
     if not inside.any():
@@ -300,6 +299,20 @@ def _noise_ratio(patch: Patch, image: FloatArray, frames: slice) -> float:
     return here / usual
 
 
+def _changes(heights: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean after minus mean before each possible change, and the gain in likelihood; NaN if none.
+
+    Shapes: `heights, weight` (t,), results (t − 1,).
+    """
+    light, total = np.cumsum(weight), np.cumsum(weight * heights)
+    before, first = light[:-1], total[:-1]
+    after, last = light[-1:] - before, total[-1:] - first
+    known = (before > 0) & (np.cumsum(weight[::-1])[-2::-1] > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        jump = np.where(known, last / after - first / before, 0.0)
+        return jump, np.where(known, 0.5 * before * after / light[-1:] * jump**2, np.nan)
+
+
 def _p_constant(heights: FloatArray, weight: FloatArray) -> float:
     """Chance that constant heights, of variance 1/weight, seem to change as much at some frame.
 
@@ -308,11 +321,10 @@ def _p_constant(heights: FloatArray, weight: FloatArray) -> float:
     Tail of the likelihood ratio of one change of mean anywhere: B. James, K. L. James and
     D. Siegmund, Biometrika 74, 71 (1987), eq. (4).
     """
-    scratch = np.empty((2, max(heights.size - 1, 0)))
-    largest, lit = one_change(heights, weight, *scratch)
+    lit = int(np.count_nonzero(weight > 0))
     if lit < 3:
         return 1.0
-    b = math.sqrt(2 * largest)
+    b = math.sqrt(2 * float(np.nanmax(_changes(heights, weight)[1])))
     density = math.exp(-0.5 * b * b) / math.sqrt(2 * math.pi)
     widest = 2 * math.log(lit - 1)  # ln of the odds of the last split over the first
     tail = density * ((b - 1 / b) * widest + 4 / b) if b > 1 else 1.0
@@ -333,7 +345,8 @@ def crosstalk(patch: Patch, image: FloatArray, others: Sequence[FloatArray]) -> 
 
 def _projector(patch: Patch, image: FloatArray) -> tuple[FloatArray, float]:
     """Weights that measure the amplitude of an image and ignore a common level, and their scale."""
-    weights = np.empty(image.shape)
-    read = np.atleast_2d(np.asarray(patch.read_noise_e, dtype=np.float64))
-    mean, used, seen = (np.ascontiguousarray(part) for part in (patch.mean_e, patch.usable, image))
-    return weights, projector(mean, read, used, seen, weights)
+    mean = np.where(patch.usable, patch.mean_e, 1.0)
+    share = patch.usable * mean / (mean + np.square(patch.read_noise_e))
+    light = mean * share
+    weights = share * (image - np.sum(light * image) / max(float(np.sum(light)), 1e-300))
+    return weights, max(float(np.sum(weights * mean * image)), 1e-300)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.sliding import block_sums, frame_totals, part_sums, region_sum
+from iscat_analysis._kernels.sliding import block_sums, frame_totals
 from iscat_analysis.camera import Camera, find_defects
 from iscat_analysis.last_used import LastUsed
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, InPlace, Mapper, PlacedSource
@@ -388,8 +388,7 @@ class Patch:
         Shapes: `electrons` (ny, nx).
         """
         part = self.frames(start, stop)
-        out = np.zeros(self.mean_e.shape)
-        region_sum(part.pixels, part.good, out.reshape(-1))
+        out = part.counts[part.good].sum(axis=0, dtype=np.float64)
         frames = int(np.count_nonzero(part.good))
         return self.gain * (out - frames * self.offset), frames, float(part.power.sum())
 
@@ -399,8 +398,9 @@ class Patch:
         Shapes: `electrons` (n, ny, nx), `frames` (n,), `power` (n,).
         """
         edges = np.clip(np.asarray(ends, dtype=np.int64) - self.first, 0, len(self.good))
-        out = np.empty((edges.size - 1, *self.mean_e.shape))
-        part_sums(self.counts, self.good, edges, out)
+        parts = (slice(*ends) for ends in pairwise(edges.tolist()))
+        sums = [self.counts[p][self.good[p]].sum(axis=0, dtype=np.float64) for p in parts]
+        out = np.reshape(sums, (edges.size - 1, *self.mean_e.shape))
         known = np.zeros((2, len(self.good) + 1))
         np.cumsum(self.good, out=known[0, 1:])
         np.cumsum(self.power, out=known[1, 1:])

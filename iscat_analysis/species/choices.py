@@ -303,7 +303,7 @@ def ascend(events: Events, start: Mixture, steps: int = 40) -> Mixture:
     rows, middle = width_prior(mean[own])
     precision, pull = rows.T @ rows, rows.T @ middle
     for _ in range(steps):
-        sums = mixture_sums(events.x, events.variance, weight, mean, variance)[1]
+        sums = mixture_sums(events.x, events.variance, (weight, mean, variance))[1]
         size, first, second, _, noisy = sums[own].T
         size = size + 1e-12
         before = variance[own]
@@ -322,9 +322,8 @@ def ascend(events: Events, start: Mixture, steps: int = 40) -> Mixture:
 
 def height(events: Events, start: Mixture) -> float:
     """Log-likelihood of a start, without selection by the detector."""
-    return float(
-        mixture_score(events.x, events.variance, start.weight, start.mean, start.variance)[0]
-    )
+    species = start.weight, start.mean, start.variance
+    return float(mixture_score(events.x, events.variance, species)[0])
 
 
 def by_peaks(events: Events, fit: Mixture) -> Mixture:

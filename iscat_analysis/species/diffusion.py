@@ -99,14 +99,16 @@ class Displacements:
 
     def likelihood(self, d_nm2_s: float) -> Likelihood:
         """Log-likelihood of free diffusion."""
-        return Likelihood(*displacement_likelihood(self.steps_nm, *self.error, *self.rate, d_nm2_s))
+        return Likelihood(
+            *displacement_likelihood((self.steps_nm, *self.error, *self.rate), d_nm2_s)
+        )
 
     @cached_property
     def best_nm2_s(self) -> float:
         """D of highest likelihood [nm²/s]."""
         scale = float(np.mean(self.steps_nm**2 / self.rate[0]))
         scale = scale or float(np.mean(self.error[0] / self.rate[0]))
-        return float(most_likely_diffusion(self.steps_nm, *self.error, *self.rate, scale))
+        return float(most_likely_diffusion((self.steps_nm, *self.error, *self.rate), scale))
 
     @cached_property
     def best(self) -> Likelihood:

@@ -281,11 +281,11 @@ def stretch_of(track: Displacements, kept: slice) -> Displacements:
 
 def _harmonic_trap(track: Displacements) -> tuple[float, float, float]:
     """Find the well of highest likelihood: the ratio, D [nm²/s] and κ [1/s]."""
-    value, d, stiffness = most_likely_well(
-        track.positions_nm, track.variance_nm2, track.gaps_s, track.exposure_s,
-        track.best_nm2_s or float(np.mean(track.steps_nm**2 / track.rate[0])),
-        _LEAST_STIFFNESS / float(track.gaps_s.sum()), _LARGEST_STIFFNESS / track.interval_s,
-    )  # fmt: skip
+    timed = track.positions_nm, track.variance_nm2, track.gaps_s, track.exposure_s
+    scale = track.best_nm2_s or float(np.mean(track.steps_nm**2 / track.rate[0]))
+    softest = _LEAST_STIFFNESS / float(track.gaps_s.sum())
+    stiffest = _LARGEST_STIFFNESS / track.interval_s
+    value, d, stiffness = most_likely_well(timed, scale, softest, stiffest)
     return max(2 * (value - track.best.value), 0.0), d, stiffness
 
 

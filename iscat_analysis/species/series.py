@@ -344,7 +344,7 @@ class Series:
         for number, table in enumerate(self.tables):
             if table.x.size:
                 values[number], by_part[number] = mixture_score(
-                    table.x, table.noise, weight[number], mean, variance
+                    table.x, table.noise, (weight[number], mean, variance)
                 )
         # The chance that a particle of a part is seen within the window, (tables, parts).
         limit, spread = self.shared(theta).limit

@@ -108,16 +108,13 @@ def score(events: Events, mixture: Mixture) -> tuple[float, FloatArray]:
     Shapes: `slopes` (3, k).
     """
     n = events.x.size
-    value, slopes = mixture_score(
-        events.x, events.variance, mixture.weight, mixture.mean, mixture.variance
-    )
+    species = mixture.weight, mixture.mean, mixture.variance
+    value, slopes = mixture_score(events.x, events.variance, species)
     if events.efficiency is None:
         slopes[0] -= n * mixture.weight
         return value, slopes
-    seen, missed = detection_score(
-        events.filter_variance[:, 0], events.efficiency.threshold_kda,
-        n // len(events.filter_variance), mixture.weight, mixture.mean, mixture.variance,
-    )  # fmt: skip
+    noise, threshold_kda = events.filter_variance[:, 0], events.efficiency.threshold_kda
+    seen, missed = detection_score(noise, threshold_kda, n // len(noise), species)
     return value - seen + events.log_seen, slopes - missed
 
 

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels.background_response import Slopes
 from iscat_analysis._kernels.canvas import (
+    Brush,
     Canvas,
     Counts,
     Field,
@@ -41,10 +42,10 @@ from iscat_analysis._kernels.canvas import (
     subtract_expected,
 )
 from iscat_analysis._kernels.lens import LatticeLens, RoundLens, StampLens
-from iscat_analysis._kernels.moving import Fits, Room, Search, fit_frames
+from iscat_analysis._kernels.moving import Fits, Room, Scene, Search, Totals, fit_frames
 from iscat_analysis._kernels.radial import POWERS
 from iscat_analysis._kernels.scoring import CONVERGED, maximize
-from iscat_analysis._kernels.track_precision import judge_frames
+from iscat_analysis._kernels.track_precision import Judgements, judge_frames
 from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.laws import POISSON
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
@@ -142,8 +143,9 @@ def draw_rows(
     field: Field, near: Pictures, far: Pictures, rows: Rows, span: tuple[int, int], canvas: Canvas
 ) -> None:
     """Update a range of frames of the canvas to the current rows."""
-    profiles, area = (_profile(near, 1), _profile(far, 1)), max(field.drawn, field.side) ** 2
-    draw_frames(field, near, far, rows, *span, canvas, *profiles, np.empty(area))
+    room = np.empty(max(field.drawn, field.side) ** 2, near.nodes.dtype)
+    brushes = (Brush(pictures, _profile(pictures, 1), room) for pictures in (near, far))
+    draw_frames(field, *brushes, rows, *span, canvas)
 
 
 def fit_with_search(
@@ -165,10 +167,9 @@ def fit_with_search(
     pixels = x[left:right], y[top:bottom], offsets, weights
     lower = np.maximum(search.lower, start - search.reach)
     upper = np.minimum(search.upper, start + search.reach)
-    box = search.free, lower, upper, search.max_step, search.tolerance, search.passes
-    image, nothing = (table, tuple(lens), pixels), (-math.inf, (0.0, 0.0))
-    theta, fisher = rows.theta[row], np.empty((5, 5))
-    value, _, outcome = maximize(*image, POISSON.code, data, *box, theta, fisher, *nothing)
+    box = search.free, lower, upper, search.max_step, search.tolerance, search.passes, -math.inf
+    picture, theta = (table, tuple(lens), pixels), rows.theta[row]
+    value, _, outcome, _ = maximize(picture, (POISSON.code, data), box, (0.0, 0.0), theta)
     return value, outcome
 
 
@@ -391,18 +392,16 @@ class MovingField:
         def some(first: int) -> NDArray[np.float32]:
             last = min(first + at_once, frames)
             draw_rows(field, near, far, particles, (first, last), canvas)
-            sums, room = (
-                np.zeros(self.used.shape, dtype=np.float32),
-                room_for(field, near, self.free),
-            )
+            room = room_for(field, near, self.free)
+            scene = Scene(light, field, near, canvas, slopes, room)
+            totals = Totals(background, expected, np.zeros(self.used.shape, dtype=np.float32))
             place = np.array([first, 0, particles.starts[first], 0, 0, 0, 0])
-            given = light, field, near, search, particles, last, sweeps, canvas, slopes, fits
-            while not fit_frames(*given, expected, background, sums, place, room):
+            while not fit_frames(scene, search, particles, (last, sweeps), fits, totals, place):
                 row = int(place[2])
                 fits.gain[row], fits.outcome[row] = fit_with_search(
                     field, near, search, place, room, particles
                 )
-            return sums
+            return totals.sums
 
         sums = self.sum_of(some, frames, at_once)
         if sweeps:
@@ -478,14 +477,15 @@ class MovingField:
         particles = Rows(rows.starts(self.frames), rows.theta, rows.group)
         fisher, (turned, ways) = np.zeros((n, 4, 4)), np.full((2, n, 4, 4), np.nan)
         bias, numbers = np.zeros((n, 4)), np.zeros((n, 6))
+        out = Judgements(fisher, turned, ways, bias, numbers)
         canvas, slopes = self._canvas_for(rows, coarse=False), self._slopes_of(n, self._whole.side)
 
         def some(part: int) -> None:
             span = part * BLOCK, min((part + 1) * BLOCK, self.frames)
             draw_rows(self._whole, near, far, particles, span, canvas)
-            given = light, self._whole, near, self.free, particles, *span, canvas, slopes
             room = room_for(self._whole, near, self.free)
-            judge_frames(*given, fisher, turned, ways, bias, numbers, room)
+            scene = Scene(light, self._whole, near, canvas, slopes, room)
+            judge_frames(scene, self.free, particles, *span, out)
 
         self.share(some, math.ceil(self.frames / BLOCK))
         index = np.flatnonzero(self.free[:4])

@@ -14,7 +14,6 @@ import subprocess
 import sys
 import threading
 import time
-import zipfile
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -307,41 +306,15 @@ def test_kernels_that_are_loaded_after_an_edit_are_not_kept_as_those_of_before(s
     assert small.run()[0].startswith("6.0 ")
 
 
-STEPS = """
-import os, sys
+def test_two_layouts_are_not_confused(small):
+    code = """
 import numpy as np
 from iscat_analysis._kernels.layouts import total
-values = np.arange(10.0){layout}
-replace = os.replace
-def paused(*names):
-    print("paused", flush=True)
-    sys.stdin.readline()
-    replace(*names)
-os.replace = paused
-sys.stdin.readline()
-result = total(values)
-os.replace = replace
-print(result, flush=True)
+print(total(np.arange(10.0){}), sum(total.stats.cache_hits.values()))
 """
-
-
-def test_two_layouts_that_are_compiled_at_the_same_time_are_not_confused(small):
-    """The files of each process get their names while the other is between two such moments."""
-    first, other = (small.start(STEPS.format(layout=layout)) for layout in ("", "[::-2]"))
-    assert tell(first) == tell(other) == "paused"
-    answers = [tell(first)]
-    for process, right in ((other, "25.0"), (first, "45.0")):
-        answer = answers.pop() if process is first else "paused"
-        while answer == "paused":
-            answer = tell(process)
-        assert answer == right
-        process.communicate(timeout=300)
-    later = """
-import numpy as np
-from iscat_analysis._kernels.layouts import total
-print(total(np.arange(10.0)), total(np.arange(10.0)[::-2]), sum(total.stats.cache_hits.values()))
-"""
-    assert small.run(later) == ("45.0 25.0 2", "")
+    for hits in ("0", "1"):
+        for layout, right in (("", "45.0"), ("[::-2]", "25.0")):
+            assert small.run(code.format(layout)) == (f"{right} {hits}", "")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no SIGKILL")
@@ -369,42 +342,6 @@ os.replace = dying
     out, _ = beside.communicate("go\n", timeout=300)
     assert out.split() == ["7.0", str(int(moment == "after"))]
     assert kept.run() == ("7.0 1", "")
-
-
-def wheel(small: Small, version: str, folder: Path) -> str:
-    """Pack the package."""
-    info = f"iscat_analysis-{version}.dist-info"
-    path = folder / f"iscat_analysis-{version}-py3-none-any.whl"
-    tag = "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
-    files = {
-        str(file.relative_to(small.root)): file.read_bytes() for file in small.root.rglob("*.py")
-    } | {
-        f"{info}/METADATA": f"Metadata-Version: 2.1\nName: iscat-analysis\nVersion: {version}\n",
-        f"{info}/WHEEL": tag,
-    }
-    with zipfile.ZipFile(path, "w") as packed:
-        for name, content in files.items():
-            packed.writestr(name, content)
-        packed.writestr(
-            f"{info}/RECORD", "".join(f"{name},,\n" for name in (*files, f"{info}/RECORD"))
-        )
-    return str(path)
-
-
-def test_a_new_version_that_is_installed_over_the_old_one_runs_its_own_kernels(kept, tmp_path):
-    place = tmp_path / "installed"
-    for version, result in (("0.1.0", "6.0"), ("0.1.1", "600.0")):
-        subprocess.run(
-            [
-                sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index",
-                "--no-compile", "--upgrade", "--target", str(place), wheel(kept, version, tmp_path),
-            ],
-            check=True, stdin=subprocess.DEVNULL,
-        )  # fmt: skip
-        here = "import iscat_analysis, sys\nassert 'installed' in iscat_analysis.__file__\n"
-        said, _ = kept.run(here + SCALE, PYTHONPATH=str(place))
-        assert said.split()[0] == result
-        kept.edit()
 
 
 def _cut(content: bytes) -> bytes:

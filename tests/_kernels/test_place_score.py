@@ -9,7 +9,7 @@ from iscat_analysis._kernels.lattice import DEGREE, TAPS
 from iscat_analysis._kernels.lens import RoundLens, StampLens
 from iscat_analysis._kernels.moving import place_score
 from iscat_analysis._kernels.noise import POISSON
-from iscat_analysis._kernels.scoring import image_score, image_value
+from iscat_analysis._kernels.scoring import image_score
 
 ROUNDING = 1e-11  # of sums over pixels in another order
 ALONG_Z = RoundLens(0.1, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0)
@@ -35,10 +35,10 @@ def test_one_pass_says_what_three_say(with_z, contrast, read_e2):
     value = place_score(data, here, lens, score, fisher)
 
     wanted_score, wanted = np.empty(5), np.empty((5, 5))
-    image_score(POISSON, data, 1.0, here, wanted_score, wanted)
+    wanted_value = image_score((POISSON, data), 1.0, here, (wanted_score, wanted))
     wanted_score[4] = wanted[4] = wanted[:, 4] = 0.0
     scale = np.sqrt(np.diag(wanted))
-    assert value == pytest.approx(image_value(POISSON, data, 1.0, here), rel=ROUNDING)
+    assert value == pytest.approx(wanted_value, rel=ROUNDING)
     np.testing.assert_allclose(score, wanted_score, rtol=0, atol=ROUNDING * scale.max() * side)
     np.testing.assert_allclose(fisher, wanted, rtol=0, atol=ROUNDING * np.abs(wanted).max())
     assert np.isfinite(value)

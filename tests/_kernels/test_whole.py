@@ -42,4 +42,4 @@ def test_mixtures_read_no_memory_but_their_own(wrong: float, place: str) -> None
     x, noise = np.linspace(50.0, 150.0, 300), np.full(300, 64.0)
     (x if place == "mass" else noise)[::7] = wrong
     weight, mean, variance = np.array([0.5, 0.5]), np.array([80.0, 120.0]), np.array([9.0, 9.0])
-    assert mixture_score(x, noise, weight, mean, variance)[1].shape == (3, 2)
+    assert mixture_score(x, noise, (weight, mean, variance))[1].shape == (3, 2)

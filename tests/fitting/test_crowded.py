@@ -179,8 +179,8 @@ def test_particles_that_poor_fits_conceal_are_found_together() -> None:
 @pytest.mark.large
 def test_particles_tried_one_by_one_stay_concealed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Control, in which large ones, which are tried one by one, are not looked for either."""
-    monkeypatch.setattr(field, "_with_concealed", lambda *_: None)
-    monkeypatch.setattr(field, "_large_ones", lambda _, windows, *__: ([], windows))
+    monkeypatch.setattr(field.FieldFit, "with_concealed", lambda *_: None)
+    monkeypatch.setattr(field.FieldFit, "large_ones", lambda _: [])
     found, *_ = _dense()
     assert sum(not e.flags for e in found) < 25
 
@@ -197,5 +197,5 @@ def test_nothing_is_found_together_in_what_a_wrong_model_leaves_over(
     assert sum("poor_fit" in e.flags for e in found) >= 10
     false = apart.min(axis=1) > 3
     assert all(e.flags for e, off in zip(found, false, strict=True) if off)
-    monkeypatch.setattr(field, "_with_concealed", lambda *_: None)
+    monkeypatch.setattr(field.FieldFit, "with_concealed", lambda *_: None)
     assert false.sum() <= (_fitted(microscope, landings)[1].min(axis=1) > 3).sum()

@@ -12,7 +12,7 @@ from scenes import PIXEL_NM, gold, make_config
 
 from iscat_analysis._kernels.hessian import PAIRS, first_order_bias
 from iscat_analysis._kernels.image import signal_gradient, signal_image
-from iscat_analysis._kernels.scoring import image_score, image_value, picture_at, score_pass
+from iscat_analysis._kernels.scoring import image_score, picture_at, score_pass
 from iscat_analysis.config import Calibration
 from iscat_analysis.inference import counts as noise
 from iscat_analysis.inference.fit import (
@@ -138,16 +138,15 @@ def _bias(which: Likelihood, theta: FloatArray, free: BoolArray) -> FloatArray:
 def test_bias(case: Case, free: tuple[bool, ...]) -> None:
     which, free_array = case.likelihood, np.array(free)
     derivatives = which.derivatives(case.theta)
-    got, lost = np.empty((2, 5))
     level = math.exp(case.theta[LEVEL])
-    first_order_bias(which.noise.code, which.data, level, derivatives, free_array, got)
+    got = first_order_bias(which.measured, level, derivatives, free_array)
     slow = _bias(which, case.theta, free_array)
     scale = 1 / np.sqrt(np.diag(which.score_fisher(case.theta)[2]))
     np.testing.assert_allclose(got / scale, slow / scale, atol=1e-9)
     assert np.abs(slow / scale).max() > 1e-5
     nowhere = case.theta * np.array([1, 1, 1, 0, 1])
     none = which.derivatives(nowhere)
-    first_order_bias(which.noise.code, which.data, level, none, free_array, lost)
+    lost = first_order_bias(which.measured, level, none, free_array)
     assert np.isnan(lost).any() or not case.model.rho
 
 
@@ -445,12 +444,10 @@ def test_strips_of_a_picture_are_scored_as_its_rows(kind: str, rows: int) -> Non
         table, lens, model.height_nm, 0, table.heights.shape[3], np.empty((0, 0, 0))
     )
     got, score, wanted = np.empty((5, 5)), np.empty((2, 5)), np.empty((5, 5))
-    value = score_pass(profile, lens, pixels, which.noise.code, which.data, theta, score[0], got)
-    signal_gradient(profile, lens, pixels, theta[0], theta[1], theta[3], out)
-    image_score(which.noise.code, which.data, math.exp(theta[LEVEL]), out, score[1], wanted)
-    assert value == pytest.approx(
-        image_value(which.noise.code, which.data, math.exp(theta[LEVEL]), out), rel=1e-10
-    )
+    value = score_pass(profile, lens, pixels, which.measured, theta, (score[0], got))
+    signal_gradient(profile, lens, pixels, theta, out)
+    there = image_score(which.measured, math.exp(theta[LEVEL]), out, (score[1], wanted))
+    assert value == pytest.approx(there, rel=1e-10)
     unit = np.sqrt(np.diag(wanted) + 1e-300)
     np.testing.assert_allclose(score[0] / unit, score[1] / unit, atol=1e-9)
     np.testing.assert_allclose(got, wanted, atol=1e-12 * np.outer(unit, unit).max(), rtol=1e-10)
@@ -505,13 +502,7 @@ def test_a_picture_is_exact_on_its_nodes_in_any_unit_of_mass(gradient_per_kda: f
     field = model.amplitude_image(GRID, x, y, model.height_nm, amplitude)
     picture = np.empty(GRID.shape)
     nodes = 2 * lens.half + 1
-    signal_image(
-        table.heights[0, 0].reshape(2, nodes, -1),
-        lens,
-        model.pixels(GRID),
-        x,
-        y,
-        amplitude,
-        picture,
-    )
+    theta = np.array([x, y, model.height_nm, amplitude])
+    profile = table.heights[0, 0].reshape(2, nodes, -1)
+    signal_image(profile, lens, model.pixels(GRID), theta, picture)
     assert np.abs(picture - field).max() < 1e-12

@@ -86,7 +86,7 @@ def test_the_level_looks_like_its_direction(name: str) -> None:
 def test_kernels_and_arrays_have_one_likelihood(name: str) -> None:
     model, data = NOISE_LAWS[name], _drawn(name, 5)
     signal = np.random.default_rng(6).normal(0, 0.05, SHAPE)
-    kernels = signal_value(model.code, data, np.exp(0.02), signal.ravel())
+    kernels = signal_value((model.code, data), np.exp(0.02), signal.ravel())
     assert model.terms(data, signal, 0.02).value == pytest.approx(kernels, rel=1e-9)
     brighter = model.multiplied(data, np.full(SHAPE, 1.03))
     change = model.reference_change(brighter, data)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from iscat_analysis._kernels.sliding import step_energy
 from iscat_analysis.camera import Camera
 from iscat_analysis.records import FloatArray
-from iscat_analysis.search.bright import BrightStep, find_bright_steps
+from iscat_analysis.search.bright import BrightStep, excess_of, find_bright_steps
 from iscat_analysis.search.frames import Chunk, make_chunk, measure_frames
 from iscat_analysis.search.sliding import STRIDES
 
@@ -81,20 +80,13 @@ def test_one_place_that_changes_twice_is_dated_apart_or_left_out() -> None:
 def test_energy_of_squares_is_the_mean_of_their_pixels(side: int) -> None:
     """Also at the border, where squares are cut, and beside pixels that are left out."""
     random = np.random.default_rng(9)
-    rows, columns = 11, 17
-    earlier, later = random.poisson(LEVEL, (2, 3, rows, columns)).astype(np.float32)
-    moved = (0.01 * random.standard_normal((rows, columns))).astype(np.float32)
-    used = random.random((rows, columns)) > 0.1
-    earlier[:, 0, 0] = 0.0
-    read = random.uniform(0, 50, (rows, columns))
-    cells = -(-rows // side), -(-columns // side)
-    excess, share = np.empty((2, *cells), dtype=np.float32)
-    step_energy(earlier, later, moved, used, read, 1.3, side, excess, share)
-    used[0, 0] = False
-    before, after = earlier.sum(axis=0) * (1 + moved), later.sum(axis=0)
-    change = after - before * after[used].sum() / before[used].sum()
-    each = np.where(used, change**2 / (after + 1.3**2 * before + read) - 1, 0.0)
+    change = random.standard_normal((11, 17))
+    used = random.random(change.shape) > 0.1
+    variance = np.where(used, random.uniform(0.5, 2.0, change.shape), 0.0)
+    excess, share = excess_of(change, variance, used, side)
+    assert share.shape == (-(-11 // side), -(-17 // side))
+    each = np.where(used, change**2 / np.where(used, variance, 1.0) - 1, 0.0)
     for values, found in ((each, excess), (used, share)):
-        for i, j in np.ndindex(cells):
+        for i, j in np.ndindex(share.shape):
             square = values[i * side : (i + 1) * side, j * side : (j + 1) * side]
             assert found[i, j] == pytest.approx(square.mean(), rel=1e-3, abs=1e-3)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.sliding import strongest_maps
 from iscat_analysis.camera import Camera
 from iscat_analysis.search.dating import crosstalk, locate_step
 from iscat_analysis.search.frames import (
@@ -153,14 +152,6 @@ def test_a_patch_beyond_the_frames_is_refused(
 ) -> None:
     with pytest.raises(IndexError, match="frames of shape"):
         _chunk(_movie(20, 3)).patch(0, 20, rows, columns)
-
-
-def test_the_strongest_map_of_each_pixel() -> None:
-    maps = np.random.default_rng(4).standard_normal((9, *SHAPE)).astype("f4")
-    maps[6] = -maps[2]  # of two that are as far from 0, the first
-    found = np.empty(SHAPE, dtype=np.int64)
-    strongest_maps(maps, found)
-    np.testing.assert_array_equal(found, np.abs(maps).argmax(axis=0))
 
 
 def test_stuck_and_dark_frames_do_not_exist() -> None:

@@ -85,7 +85,7 @@ def test_likelihoods_of_many_d_are_those_of_each(kept: float) -> None:
     counted = np.random.default_rng(5).random(89) <= kept
     track = gather(**arguments, counted=counted)
     ladder = np.array([0.0, 1e2, 1e4, 0.15e6, 3e6, 1e8, 5.0])
-    found = displacement_likelihoods(track.steps_nm, *track.error, *track.rate, ladder)
+    found = displacement_likelihoods((track.steps_nm, *track.error, *track.rate), ladder)
     assert found == pytest.approx([track.likelihood(d).value for d in ladder], rel=1e-12)
 
 
@@ -281,18 +281,15 @@ def test_the_filter_of_a_well_is_the_dense_likelihood(exposure: float, stiffness
         mean *= 2 * (np.cosh(u) - 1) / u**2
         np.fill_diagonal(mean, 2 * (u - 1 + np.exp(-u)) / u**2)
     wells = np.array([7.0, stiffness, 3.0])
-    found = harmonic_likelihoods(
-        track.positions_nm, track.variance_nm2, track.gaps_s, e, np.array([1e4, d, 1e7]), wells
-    )[1]
+    timed = track.positions_nm, track.variance_nm2, track.gaps_s, e
+    found = harmonic_likelihoods(timed, np.array([1e4, d, 1e7]), wells)[1]
     assert found == pytest.approx(dense(track, d, mean / stiffness), rel=1e-8)
 
 
 def test_a_soft_well_is_none() -> None:
     track = make_track()
-    (soft,) = harmonic_likelihoods(
-        track.positions_nm, track.variance_nm2, track.gaps_s, track.exposure_s,
-        np.array([0.15e6]), np.array([1e-4]),
-    )  # fmt: skip
+    timed = track.positions_nm, track.variance_nm2, track.gaps_s, track.exposure_s
+    (soft,) = harmonic_likelihoods(timed, np.array([0.15e6]), np.array([1e-4]))
     assert soft == pytest.approx(track.likelihood(0.15e6).value, abs=1e-3)
 
 
@@ -306,7 +303,7 @@ def test_the_best_well_is_that_of_a_simplex_search(walled: bool, seed: int) -> N
 
     def lost(theta: np.ndarray) -> float:
         wells = d * np.exp(theta[:1]), np.exp(theta[1:])
-        return -float(harmonic_likelihoods(*given_ones, *wells)[0])
+        return -float(harmonic_likelihoods(given_ones, *wells)[0])
 
     rungs = np.linspace(math.log(soft), math.log(stiff), 6)
     limits = [(-10.0, 10.0), (rungs[0], rungs[-1])]
@@ -314,7 +311,7 @@ def test_the_best_well_is_that_of_a_simplex_search(walled: bool, seed: int) -> N
         minimize(lost, (0.0, rung), method="Nelder-Mead", tol=1e-6, bounds=limits).fun
         for rung in rungs
     )
-    value, d_there, stiffness = most_likely_well(*given_ones, d, soft, stiff)
+    value, d_there, stiffness = most_likely_well(given_ones, d, soft, stiff)
     assert value == pytest.approx(-best, abs=1e-3)
     assert value == pytest.approx(-lost(np.log([d_there / d, stiffness])), rel=1e-12)
 

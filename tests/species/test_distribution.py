@@ -41,11 +41,11 @@ def test_the_likelihood_is_that_of_scipy_and_so_is_its_slope() -> None:
 
     def value(theta: NDArray[np.float64]) -> float:
         w, m, v = np.exp(theta[:2]), theta[2:4], theta[4:]
-        return float(mixture_score(x, sigma**2, w, m, v)[0])
+        return float(mixture_score(x, sigma**2, (w, m, v))[0])
 
     densities = norm.pdf(x[:, None], mean, np.sqrt(variance + sigma[:, None] ** 2))
     expected = np.log(densities @ weight).sum()
-    found, gradient = mixture_score(x, sigma**2, weight, mean, variance)
+    found, gradient = mixture_score(x, sigma**2, (weight, mean, variance))
     assert found == pytest.approx(expected, rel=1e-12)
     theta = np.concatenate([np.log(weight), mean, variance])
     assert np.allclose(gradient.ravel(), approx_fprime(theta, value, 1e-6), rtol=1e-4, atol=1e-3)
@@ -62,7 +62,7 @@ def test_what_detection_takes_off_is_that_of_scipy_and_so_is_its_slope(same_nois
         mixture = Mixture(np.exp(theta[:2]), theta[2:4], theta[4:])
         value, slopes = detection_score(
             events.filter_variance[:, 0], efficiency.threshold_kda, 40 if same_noise else 1,
-            mixture.weight, mixture.mean, mixture.variance,
+            (mixture.weight, mixture.mean, mixture.variance),
         )  # fmt: skip
         return value, slopes.ravel()
 
@@ -82,14 +82,14 @@ def test_far_from_every_species_the_likelihood_goes_on() -> None:
     w, m, v = np.array([0.3, 0.7]), np.array([10.0, 20.0]), np.array([1.0, 4.0])
     spread = np.sqrt(v + noise[:, None])
     expected = logsumexp(np.log(w) + norm.logpdf(x[:, None], m, spread), axis=1).sum()
-    value, slope = mixture_score(x, noise, w, m, v)
+    value, slope = mixture_score(x, noise, (w, m, v))
     assert value == pytest.approx(expected, rel=1e-12)
-    numerical = approx_fprime(m, lambda m: mixture_score(x, noise, w, m, v)[0], 1e-5)
+    numerical = approx_fprime(m, lambda m: mixture_score(x, noise, (w, m, v))[0], 1e-5)
     assert np.allclose(slope[1], numerical, rtol=1e-3)
     expected = logsumexp(np.log(w) + log_ndtr((m - 200) / spread), axis=1).sum()
-    value, slope = detection_score(noise, 200.0, 1, w, m, v)
+    value, slope = detection_score(noise, 200.0, 1, (w, m, v))
     assert value == pytest.approx(expected, rel=1e-12)
-    numerical = approx_fprime(m, lambda m: detection_score(noise, 200.0, 1, w, m, v)[0], 1e-5)
+    numerical = approx_fprime(m, lambda m: detection_score(noise, 200.0, 1, (w, m, v))[0], 1e-5)
     assert np.allclose(slope[1], numerical, rtol=1e-3, atol=1e-6)
 
 
@@ -111,7 +111,7 @@ def test_a_step_of_em_is_what_its_definition_says_for_any_number_of_events() -> 
         assert found.weight == pytest.approx(size / n, rel=1e-11)
         assert found.mean == pytest.approx(mean, rel=1e-11)
         assert found.variance == pytest.approx(square / size - (mean - m) ** 2, rel=1e-9, abs=1e-9)
-        value, _ = mixture_score(x, noise, w, m, v)
+        value, _ = mixture_score(x, noise, (w, m, v))
         assert value == pytest.approx(logsumexp(density, axis=1).sum(), rel=1e-12)
 
 
@@ -289,7 +289,7 @@ def test_efficiency_is_half_at_the_threshold() -> None:
 @pytest.mark.parametrize("mean", [-300.0, -120.0, -99.0, 0.0, 300.0])
 def test_far_below_the_threshold_the_chance_is_that_of_scipy(mean: float) -> None:
     one = (np.array([1.0]), np.array([mean]), np.array([0.0]))
-    value, slopes = detection_score(np.array([25.0]), 0.0, 1, *one)
+    value, slopes = detection_score(np.array([25.0]), 0.0, 1, one)
     assert value == pytest.approx(float(log_ndtr(mean / 5)), rel=1e-9)
     hazard = math.exp(norm.logpdf(mean / 5) - float(log_ndtr(mean / 5)))
     assert slopes[1, 0] == pytest.approx(hazard / 5, rel=1e-6)

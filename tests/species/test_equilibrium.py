@@ -187,7 +187,7 @@ def test_ends_are_on_the_profile_where_events_are_few(seed: int) -> None:
 
 def test_parameters_that_are_no_numbers_have_no_likelihood() -> None:
     x, noise, weight = np.linspace(50, 80, 40), np.full(40, 25.0), np.ones(1)
-    value, slopes = mixture_score(x, noise, weight, np.array([np.nan]), np.array([4.0]))
+    value, slopes = mixture_score(x, noise, (weight, np.array([np.nan]), np.array([4.0])))
     assert np.isnan(value)
     assert np.isnan(slopes).any()
 

@@ -265,9 +265,7 @@ def test_rows_are_fitted_by_the_one_likelihood(pool: ThreadPoolExecutor) -> None
         square = np.ix_(index, index)
         assert np.allclose((judged.observed[row] * scale)[square],
                            (observed[:4, :4] * scale)[square], atol=SECOND)  # fmt: skip
-        bias = np.empty(5)
-        rows_at = likelihood.derivatives(theta)
-        first_order_bias(likelihood.noise.code, likelihood.data, 1.0, rows_at, free, bias)
+        bias = first_order_bias(likelihood.measured, 1.0, likelihood.derivatives(theta), free)
         assert np.allclose(judged.bias[row] / sigma, bias[:4] / sigma, atol=SECOND)
         residuals = likelihood.residuals(theta)
         assert judged.chi2[row] == pytest.approx(np.nansum(residuals**2), rel=1e-5)
@@ -406,7 +404,8 @@ def test_rings_are_drawn_from_half_the_samples(brighter: float, most: float) -> 
     for band in (BAND, RINGS):
         lens, samples = sample_picture(model, PIXEL_NM, 33.0, band)
         drawn = np.zeros(exact.shape, dtype=np.float32)
-        add_stamp(samples.astype(np.float32), lens, model.pixels(grid), x, y, amplitude, 1.0, drawn)
+        theta = np.array([x, y, 0.0, amplitude])
+        add_stamp(samples.astype(np.float32), lens, model.pixels(grid), theta, 1.0, drawn)
         errors[band], fine[band] = (drawn - exact)[far].std() / exact[far].std(), lens.fine
     assert fine == {BAND: 2, RINGS: 1}
     assert errors[RINGS] < most
