@@ -169,7 +169,7 @@ def test_an_array_is_fitted_as_the_file_that_holds_it(unsampled, result) -> None
 def test_named_arguments_win(movie, config, monkeypatch) -> None:
     given: list[ia.Config] = []
 
-    def analyse(_: ia.Stack, resolved: ia.Config, **__: Any) -> None:
+    def analyse(_: ia.Stack, resolved: ia.Config, *__: Any, **___: Any) -> None:
         given.append(resolved)
 
     monkeypatch.setattr(shown, "analyse", analyse)
