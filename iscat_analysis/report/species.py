@@ -171,12 +171,13 @@ def sizes_section(found: Mapping[str, Any], figures: Mapping[str, Markup]) -> Se
         *intervals("fraction", "fraction", in_percent=True, title="of the spheres seen"),
         numeric("spheres", lambda p: fixed(p["count"], 0) + (", outlier" if p["outlier"] else "")),
     )
+    name = "Diameters and populations"
     title = f"Populations by diameter; intervals from {found['draws']} simulated repetitions"
     return Section(
         "species",
         "Sizes",
         f"{which} {found['spheres']} spheres best (BIC), each with its own error.",
-        charts=[Chart("species-figure", "Diameters", figures["sizes"], caption, True)],
+        charts=[Chart("species-figure", name, figures["sizes"], caption, True)],
         tables=[tabulate(found["populations"], columns, title)],
         notes=[sentence(note) for note in found["notes"]],
     )
