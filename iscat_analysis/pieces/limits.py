@@ -49,16 +49,16 @@ def psf(
         Its material; its height sets the focus.
     camera : Camera
         Pixel size and samples per pixel.
-    pixels : int
-        Side of the square image [pixels].
-    x_nm, y_nm : array_like
-        Particle, from the centre of the image; x along columns, y down the rows [nm].
     z_nm : array_like, optional
         Height above the coverslip [nm]; default ``particle.height_nm``.
     mass_kda : array_like, optional
         Mass [kDa]; default that of `particle`.
     calibration : Calibration, optional
         Contrast against mass, in place of the model's absolute scale.
+    pixels : int
+        Side of the square image [pixels].
+    x_nm, y_nm : array_like
+        Particle, from the centre of the image; x along columns, y down the rows [nm].
 
     Returns
     -------
@@ -133,29 +133,29 @@ def crb(
         Pixel size, samples per pixel and read noise.
     photons_per_pixel : array_like
         Background per pixel and frame [e]; in dark field it may be 0.
-    n_after : array_like
-        Frames with the particle.
-    n_before : array_like
-        Frames of background; 0 where the background is known.
-    mode : {"mass", "localize", "joint", "size"}
-        Which parameters are free; ``"size"`` is for spheres, whose mass stands for the diameter.
     joint : bool
         Whether all free parameters are unknown at once; False gives each with the others known.
         The angles of a rod are free in every mode.
     level : bool
         Whether the level of the light is unknown too.
-    pixels : int
-        Side of the square region [pixels].
-    x_nm, y_nm : array_like
-        Particle, from the centre of the region [nm].
     z_nm : array_like, optional
         Height above the coverslip [nm]; default ``particle.height_nm``.
     mass_kda : array_like, optional
         Mass [kDa]; default that of `particle`.
-    focus_nm : array_like, optional
-        Focus [nm]; default ``optics.focus_nm``.
     calibration : Calibration, optional
         Contrast against mass, in place of the model's absolute scale.
+    pixels : int
+        Side of the square region [pixels].
+    x_nm, y_nm : array_like
+        Particle, from the centre of the region [nm].
+    n_after : array_like
+        Frames with the particle.
+    mode : {"mass", "localize", "joint", "size"}
+        Which parameters are free; ``"size"`` is for spheres, whose mass stands for the diameter.
+    focus_nm : array_like, optional
+        Focus [nm]; default ``optics.focus_nm``.
+    n_before : array_like
+        Frames of background; 0 where the background is known.
 
     Returns
     -------
@@ -232,10 +232,6 @@ def qcrb(
         Its pixel size turns photons per pixel into light.
     photons_per_pixel : array_like
         Background per pixel and frame [e]; it has no effect in dark field.
-    n_after : array_like
-        Frames with the particle.
-    mode : {"mass", "localize", "joint", "size"}
-        Which parameters are free; ``"size"`` is for spheres, whose mass stands for the diameter.
     joint : bool
         Whether all free parameters are unknown at once; by default each with the others known,
         since height and mass cannot both be measured so well.
@@ -243,10 +239,14 @@ def qcrb(
         Height above the coverslip [nm]; default ``particle.height_nm``.
     mass_kda : array_like, optional
         Mass [kDa]; default that of `particle`.
-    focus_nm : array_like, optional
-        Focus [nm]; default ``optics.focus_nm``.
     calibration : Calibration, optional
         Contrast against mass, in place of the model's absolute scale.
+    n_after : array_like
+        Frames with the particle.
+    mode : {"mass", "localize", "joint", "size"}
+        Which parameters are free; ``"size"`` is for spheres, whose mass stands for the diameter.
+    focus_nm : array_like, optional
+        Focus [nm]; default ``optics.focus_nm``.
 
     Returns
     -------

@@ -85,16 +85,8 @@ def fit_rois(
         Its material, and the height or mass that a mode holds fixed.
     camera : Camera
         Pixel size, samples per pixel and read noise.
-    contrast : array_like, shape (n, y, x), optional
-        Contrast images in place of counts: light over the light without the particle, minus 1.
-    sigma : float or array_like, shape (n, y, x) or (y, x), optional
-        Standard deviation of the noise of every pixel of `contrast`, which is taken as normal and
-        independent from pixel to pixel.  `n_scattered` and ``qcrb_…`` are then unknown.
-    n_after, n_before : int
+    n_before, n_after : int
         Frames in the sums; ``n_before=0`` where the background is known.
-    mode : {"mass", "localize", "joint", "size"}
-        Which parameters are free: x, y and mass; x, y and z; all four; x, y, z and the diameter
-        of a sphere.
     power_ratio : array_like, optional
         Light after over light before, one number or one for each region, where it is known from a
         larger field; default the ratio of the frames, with `level` fitted.
@@ -102,14 +94,24 @@ def fit_rois(
         Whether a common level of the light is fitted as a nuisance; default where the background
         is measured, interferes, and no `power_ratio` is given.  A level that contrasts have in
         common is one too.
+    masked : array_like of bool, shape (n, y, x) or (y, x), optional
+        Pixels to leave out.
+    contrast : array_like, shape (n, y, x), optional
+        Contrast images in place of counts: light over the light without the particle, minus 1.
+    sigma : float or array_like, shape (n, y, x) or (y, x), optional
+        Standard deviation of the noise of every pixel of `contrast`, which is taken as normal and
+        independent from pixel to pixel.  `n_scattered` and ``qcrb_…`` are then unknown.
+    saturated : array_like of bool, shape (n, y, x) or (y, x), optional
+        Pixels to leave out as well; a fit near them is flagged.
+    mode : {"mass", "localize", "joint", "size"}
+        Which parameters are free: x, y and mass; x, y and z; all four; x, y, z and the diameter
+        of a sphere.
     z_range_nm : (float, float)
         Heights that are searched where z is free [nm].
-    masked, saturated : array_like of bool, shape (n, y, x) or (y, x), optional
-        Pixels to leave out; a fit near saturated pixels is flagged.
-    corners_px : array_like, shape (n, 2), optional
-        Row and column of each region's first pixel in the full frame, added to the positions.
     calibration : Calibration, optional
         Contrast against mass, in place of the model's absolute scale.
+    corners_px : array_like, shape (n, 2), optional
+        Row and column of each region's first pixel in the full frame, added to the positions.
     workers : int
         Number of threads; it has no effect on the result.
 
@@ -528,18 +530,18 @@ def log_likelihood(
         Its material, and the height or mass that a mode holds fixed.
     camera : Camera
         Pixel size, samples per pixel and read noise.
-    n_after, n_before : int
+    n_before, n_after : int
         Frames in the sums; ``n_before=0`` where the background is known.
-    mode : {"mass", "localize", "joint", "size"}
-        Which parameters are free.
     power_ratio : float, optional
         Light after over light before; by default the ratio of the frames, with `level` free.
     level : bool, optional
         Whether the logarithm of a common level is a parameter too; default as in `fit_rois`.
-    z_range_nm : (float, float)
-        Heights that are possible where z is free [nm].
     masked : array_like of bool, shape (y, x), optional
         Pixels to leave out.
+    mode : {"mass", "localize", "joint", "size"}
+        Which parameters are free.
+    z_range_nm : (float, float)
+        Heights that are possible where z is free [nm].
     calibration : Calibration, optional
         Contrast against mass, in place of the model's absolute scale.
 

@@ -60,7 +60,7 @@ def fit_rods(
         are not used.
     camera : Camera
         Pixel size, samples per pixel and read noise.
-    n_after, n_before : int
+    n_before, n_after : int
         Frames in the sums; ``n_before=0`` where the background is known.
     power_ratio : array_like, optional
         Light after over light before, as in `fit_rois`.
