@@ -122,8 +122,9 @@ class Batch:
             likelihood = self.setting.likelihood(self.setting.draw(truth, random))
             x, y = truth[:2] / pixel + random.uniform(-0.5, 0.5, 2)
             start = Candidate(x, y, truth[2] + random.uniform(-20, 20), truth[3] * 1.2, 0.0)
-            box = search_box(likelihood, start, "joint", (0.0, 500.0), level=True)
-            self.sets.append((likelihood, start_theta(likelihood, start), box))
+            theta = start_theta(likelihood, start)
+            box = search_box(likelihood, theta, "joint", (0.0, 500.0), level=True)
+            self.sets.append((likelihood, theta, box))
         fixed = experiment(side, "mass")
         some = range(min(max(count // 10, 10), count))
         self.whole = {
@@ -140,7 +141,7 @@ class Batch:
         """Fit some of the data sets."""
         for i in numbers:
             likelihood, start, box = self.sets[i]
-            found = likelihood.maximize(start, box.free, box.lower, box.upper)
+            found = likelihood.maximize(start, box)
             self.estimates[i] = found.theta
             self.passes[i] = found.passes
             self.converged[i] = found.converged

@@ -26,10 +26,10 @@ STYLE = {
 def cobri() -> Figure:
     """COBRI's classical bound on z below the printed quantum bound."""
     heights = np.arange(0.0, 1501.0, 15.0)
-    held = [point(paper_config("cobri", z_nm=z, focus_nm=1000.0), None).single[2] for z in heights]
+    held = [point(paper_config("cobri", z_nm=z, focus_nm=1000.0), None)["z"] for z in heights]
     photons = photons_of_authors("cobri")
     moved = [
-        point(paper_config("cobri", "dong2021", z_nm=z, focus_nm=1000.0), photons).single[2]
+        point(paper_config("cobri", "dong2021", z_nm=z, focus_nm=1000.0), photons)["z"]
         for z in heights
     ]
     figure = Figure(figsize=(6.4, 3.5), layout="constrained")

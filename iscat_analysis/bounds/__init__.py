@@ -11,12 +11,7 @@ from __future__ import annotations
 
 from iscat_analysis.bounds import paper
 from iscat_analysis.bounds.classical import EventBounds, bounds_from_matrices, event_bounds
-from iscat_analysis.bounds.detection import (
-    DetectionLimit,
-    detection_limit,
-    power_known,
-    power_searched,
-)
+from iscat_analysis.bounds.detection import DetectionLimit, detection_limit, power_searched
 from iscat_analysis.bounds.experiment import (
     Experiment,
     bounds_report,
@@ -24,19 +19,10 @@ from iscat_analysis.bounds.experiment import (
     information_fraction,
     plan,
 )
-from iscat_analysis.bounds.holevo import (
-    Holevo,
-    holevo_bound,
-    holevo_over_quantum,
-    natural_bound,
-    tradeoff,
-)
+from iscat_analysis.bounds.holevo import holevo_bound, holevo_over_quantum, natural_bound, tradeoff
 from iscat_analysis.bounds.paper import reproduce
 from iscat_analysis.bounds.planning import (
     AXES,
-    Cost,
-    Goal,
-    Scan,
     budget,
     changed,
     effort,
@@ -55,8 +41,6 @@ from iscat_analysis.bounds.quantum import (
 )
 from iscat_analysis.bounds.shared import (
     displacement,
-    eliminated,
-    imitation,
     joint_information,
     mass_drift,
     peak_gradient,

@@ -110,18 +110,13 @@ def bounds_from_matrices(
     Shapes: `fisher` (n, n), `quantum` (n, n), n = len(names).
     """
     index = [i for i, name in enumerate(names) if name in free]
-    seen = np.diag(fisher).copy()
-    limit = np.diag(quantum)
+    limit, chosen = np.diag(quantum), np.isin(names, free)
     # Share of the light's information below which a parameter is not seen at all
-    seen[~(seen > 1e-12 * limit)] = np.nan
-    single, joint, qcrb = np.full((3, len(names)), np.nan)
-    single[index] = 1 / np.sqrt(seen[index])
-    positive = [i for i in index if limit[i] > 0]
-    qcrb[positive] = 1 / np.sqrt(limit[positive])
-    unidentifiable = [
-        Unidentifiable((names[i],), (1.0,)) for i in index if not math.isfinite(seen[i])
-    ]
+    seen = np.where(chosen & (np.diag(fisher) > 1e-12 * limit), np.diag(fisher), np.nan)
+    single, joint, weakest = 1 / np.sqrt(seen), np.full(len(names), np.nan), np.zeros(len(names))
+    qcrb = 1 / np.sqrt(np.where(chosen & (limit > 0), limit, np.nan))
     visible = [i for i in index if math.isfinite(seen[i])]
+    unidentifiable = [Unidentifiable((names[i],), (1.0,)) for i in index if i not in visible]
     if not visible:
         return EventBounds(
             single, joint, qcrb, fisher, quantum, tuple(unidentifiable), (), math.nan
@@ -132,17 +127,11 @@ def bounds_from_matrices(
     for vector in vectors.T[null]:
         step = vector * scale
         parts = [k for k in range(len(visible)) if abs(vector[k]) > LEAST_COMPONENT]
-        first = step[parts[0]]
-        unidentifiable.append(
-            Unidentifiable(
-                tuple(names[visible[k]] for k in parts),
-                tuple(float(step[k] / first) for k in parts),
-            )
-        )
+        moves = (step[parts] / step[parts[0]]).tolist()
+        unidentifiable.append(Unidentifiable(tuple(names[visible[k]] for k in parts), tuple(moves)))
     involved = np.any(np.abs(vectors[:, null]) > LEAST_COMPONENT, axis=1)
     variance = np.sum(vectors[:, ~null] ** 2 / values[~null], axis=1)
     joint[visible] = np.where(involved, np.nan, scale * np.sqrt(variance))
-    weakest = np.zeros(len(names))
     weakest[visible] = vectors[:, 0]
     inflation = math.nan if unidentifiable else 1 / math.sqrt(values[0])
     return EventBounds(

@@ -22,8 +22,8 @@ import numpy as np
 import scipy
 from scipy.special import ndtr, ndtri
 
-from iscat_analysis.bounds.experiment import Experiment, expected_likelihood
-from iscat_analysis.inference.random_field import extent, height_reached
+from iscat_analysis.bounds.experiment import Experiment, detector, expected_likelihood
+from iscat_analysis.inference.random_field import Excursions, extent
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,6 @@ class DetectionLimit:
     mass_known_kda: float
     mass_searched_kda: float
     snr_per_amplitude: float
-
-
-def power_known(snr: float, threshold: float) -> float:
-    """Probability to detect a particle whose place is known."""
-    return float(ndtr(snr - threshold))
 
 
 def power_searched(snr: float, threshold: float) -> float:
@@ -66,12 +61,9 @@ def detection_limit(experiment: Experiment) -> DetectionLimit | None:
     theta = experiment.theta.copy()
     # a faint particle has derivatives with the place
     theta[3] *= 1e-6
-    read = experiment.config.camera.assumed.read_noise_e
-    empty = expected_likelihood(
-        model, experiment.grid, theta, at.photons_per_pixel, at.photons_per_pixel,
-        n_before=at.n_before, n_after=at.n_after,
-        read_noise_e=0.0 if isinstance(read, str) else read,
-    )  # fmt: skip
+    light, frames = (at.photons_per_pixel,) * 2, (at.n_before, at.n_after)
+    read = detector(experiment.config)[1]
+    empty = expected_likelihood(model, experiment.grid, theta, light, frames, read_noise_e=read)
     fisher = empty.score_fisher(theta)[2]
     if not fisher[3, 3] > 0:
         return None
@@ -80,7 +72,7 @@ def detection_limit(experiment: Experiment) -> DetectionLimit | None:
     area = extent(rough, (at.pixels * experiment.grid.pixel_nm) ** 2)
     false, miss = at.false_alarm_probability, at.miss_probability
     known = -float(ndtri(false))
-    searched = height_reached(-math.log1p(-false), area, lowest=known)
+    searched = Excursions(area).level(-math.log1p(-false), lowest=known)
     snr = known - float(ndtri(miss))
     snr_searched = float(
         scipy.optimize.brentq(

@@ -54,6 +54,22 @@ class Experiment:
         """Quantum Fisher information of one collected photon, shape (4, 4)."""
         return quantum_information(self.model, self.theta[2])
 
+    @property
+    def per_step(self) -> FloatArray:
+        """Change of each parameter in a unit step of the quantum matrix, whose mass is relative.
+
+        With a calibration that has an offset, a relative step of the amplitude is not one of the
+        mass.  Shapes: result (4,).
+        """
+        amplitude = float(self.theta[3])
+        return np.array([1.0, 1.0, 1.0, abs(amplitude * self.model.scale.slope(amplitude))])
+
+    def light(self, free: tuple[str, ...]) -> ComplexArray:
+        """Quantum Fisher information of all collected photons about chosen parameters."""
+        index = [PARAMETERS.index(name) for name in free]
+        whole = self.collected * self.quantum / np.outer(self.per_step, self.per_step)
+        return np.asarray(whole[np.ix_(index, index)])
+
     def bounds(self, free: tuple[str, ...], *, level: bool = False) -> EventBounds:
         """Bounds over chosen free parameters."""
         return event_bounds(
@@ -76,6 +92,18 @@ def detector(config: Config) -> tuple[float, float]:
     return camera.pixel_size_nm, camera.read_noise_e
 
 
+def height_of(config: Config) -> float:
+    """Height of the particle of ``[bounds]`` [nm]."""
+    z_nm = config.bounds.z_nm
+    return config.particle.nominal_height_nm if z_nm is None else z_nm
+
+
+def reach_of(config: Config) -> float:
+    """Distance from the particle to the farthest corner of the field of ``[bounds]`` [nm]."""
+    at, half = config.bounds, config.bounds.pixels * detector(config)[0] / 2
+    return 1.0001 * math.hypot(half + abs(at.x_nm), half + abs(at.y_nm))
+
+
 def plan(
     config: Config, *, model: ForwardModel | None = None, scale: MassScale | None = None
 ) -> Experiment:
@@ -89,12 +117,11 @@ def plan(
             f"±{half:g} nm: move the particle, or enlarge bounds.pixels"
         )
     grid = PixelGrid.centred(at.pixels, pixel_nm)
-    height = config.particle.nominal_height_nm if at.z_nm is None else at.z_nm
+    height = height_of(config)
     if model is None:
-        reach = math.hypot(half + abs(at.x_nm), half + abs(at.y_nm)) * 1.0001
         optics = config if scale is None else config.model_copy(update={"calibration": None})
         highest = max(height, config.particle.nominal_height_nm)
-        model = forward_model(optics, reach, z_max_nm=highest)
+        model = forward_model(optics, reach_of(config), z_max_nm=highest)
         model = replace(model, z_range_nm=(height, height))  # one height needs no more
         model = model if scale is None else replace(model, scale=scale)
     mass = model.material.mass_kda
@@ -117,10 +144,8 @@ def plan(
             model,
             grid,
             theta,
-            level,
-            per_frame,
-            n_before=at.n_before,
-            n_after=at.n_after,
+            (level, per_frame),
+            (at.n_before, at.n_after),
             read_noise_e=read_noise_e,
         ),
         theta=theta,
@@ -135,18 +160,17 @@ def expected_likelihood(
     model: ForwardModel,
     grid: PixelGrid,
     theta: FloatArray,
-    level_e: float,
-    scale_e: float,
+    light_e: tuple[float, float],
+    frames: tuple[int, int],
     *,
-    n_before: int,
-    n_after: int,
     read_noise_e: float = 0.0,
 ) -> Likelihood:
     """Likelihood of the expected counts of a planned experiment.
 
-    Shapes: `theta` (5,).
+    `light_e` is that of a frame without a particle, and that for unit signal; `frames` are those
+    before and after.  Shapes: `theta` (5,).
     """
-    read = read_noise_e**2
+    (level_e, scale_e), (n_before, n_after), read = light_e, frames, read_noise_e**2
     if model.rho and n_before:
         return asimov_conditional(
             model, grid, theta, level_e, n_before, n_after, read_variance_e2=read
@@ -161,70 +185,51 @@ def expected_likelihood(
 
 def bounds_report(config: Config) -> dict[str, Any]:
     """Everything `iscat bounds --json` prints."""
-    experiment = plan(config)
-    model = experiment.model
-    free = FREE_PARAMETERS[config.fit.mode]
-    z_nm = float(experiment.theta[2])
+    experiment, free = plan(config), FREE_PARAMETERS[config.fit.mode]
+    model, mass, z_nm = experiment.model, experiment.mass_kda, float(experiment.theta[2])
     whole = experiment.bounds(PARAMETERS)
     joint = bounds_from_matrices(whole.fisher, whole.quantum, free)
-    mass = experiment.mass_kda
-    to_rel = np.array([1.0, 1.0, 1.0, 1 / mass])
-    # with a calibration that has an offset, a relative step of the amplitude is not one of the mass
-    per_step = np.array(
-        [1.0, 1.0, 1.0, abs(experiment.theta[3]) * abs(model.scale.slope(experiment.theta[3]))]
-    )
-    root_camera = math.sqrt(experiment.on_camera)
-    root_light = math.sqrt(experiment.collected)
-    exact = experiment.quantum
-    single, joint_bounds = quantum_bounds(exact)
-    index = [PARAMETERS.index(name) for name in free]
-    steps = per_step[index]
-    light = experiment.collected * exact[np.ix_(index, index)] / np.outer(steps, steps)
-    at_once = natural_bound(light)
-    paper, _ = quantum_bounds(quantum_information(model, z_nm, measure="dong2021"))
-    per_photon: dict[str, dict[str, float]] = {}
-    actual: dict[str, dict[str, float]] = {}
+    light = experiment.light(PARAMETERS)
+    at_once = natural_bound(experiment.light(free))
+    shares = (at_once.sigma / joint.crb_joint[[PARAMETERS.index(name) for name in free]]) ** 2
+    camera, collected = math.sqrt(experiment.on_camera), math.sqrt(experiment.collected)
+    kinds = {"crb_single": (whole.crb_single, camera), "crb_joint": (joint.crb_joint, camera)}
 
-    def put(kind: str, values: FloatArray, of_one: FloatArray) -> None:
-        """Add bounds as they are, and per photon."""
-        actual[kind] = _named(PARAMETERS, values)
-        per_photon[kind] = _named(NAMES, of_one * to_rel)
+    def add_light(kind: str, of_one: FloatArray, photons: float = collected) -> None:
+        """Add a quantum bound of one photon."""
+        kinds[kind] = of_one * experiment.per_step / photons, photons
 
-    put("crb_single", whole.crb_single, whole.crb_single * root_camera)
-    put("crb_joint", joint.crb_joint, joint.crb_joint * root_camera)
-    for kind, values in (
-        ("qcrb", single), ("qcrb_joint", joint_bounds), ("qcrb_dong2021", paper)
-    ):  # fmt: skip
-        put(kind, values * per_step / root_light, values * per_step)
+    single, together = quantum_bounds(experiment.quantum)
+    add_light("qcrb", single)
+    add_light("qcrb_joint", together)
+    paper = quantum_information(model, z_nm, measure="dong2021")
+    add_light("qcrb_dong2021", quantum_bounds(paper)[0])
     losses = {}
     if config.optics.analyzer or config.optics.mask_na:
-        share = transmitted_over_collected(model, z_nm)
+        losses["transmitted_over_collected"] = share = transmitted_over_collected(model, z_nm)
         passed, _ = quantum_bounds(quantum_information(model, z_nm, light="transmitted"))
-        root = root_light * math.sqrt(share)
-        put("qcrb_transmitted", passed * per_step / root, passed * per_step)
-        losses = {"transmitted_over_collected": share}
+        add_light("qcrb_transmitted", passed, collected * math.sqrt(share))
+    actual = {kind: _named(PARAMETERS, values) for kind, (values, _) in kinds.items()}
+    relative = np.array([1.0, 1.0, 1.0, 1 / mass])
+    per_photon = {kind: _named(NAMES, v * root * relative) for kind, (v, root) in kinds.items()}
     if not model.rho:
         alone = z_nm_phase_free(model, z_nm)
         per_photon["qcrb"]["z_nm_phase_free"] = alone
-        actual["qcrb"]["z_nm_phase_free"] = alone / root_light
-    optics, rod = config.optics, model.aperture.scatterer
+        actual["qcrb"]["z_nm_phase_free"] = alone / collected
+    optics, at, rod = config.optics, config.bounds, model.aperture.scatterer
     return {
         "at": {
             "scheme": optics.scheme,
             "mode": config.fit.mode,
             "free": list(free),
-            "x_nm": config.bounds.x_nm,
-            "y_nm": config.bounds.y_nm,
+            **picked(at, "x_nm", "y_nm"),
             "z_nm": z_nm,
             "mass_kda": mass,
             "focus_nm": optics.focus_nm,
             "attenuation": optics.attenuation if model.rho else 0.0,
             "na": optics.na,
             "pixel_size_nm": experiment.grid.pixel_nm,
-            "pixels": config.bounds.pixels,
-            "photons_per_pixel": config.bounds.photons_per_pixel,
-            "n_before": config.bounds.n_before,
-            "n_after": config.bounds.n_after,
+            **picked(at, "pixels", "photons_per_pixel", "n_before", "n_after"),
         },
         "n_scattered": {"camera": experiment.on_camera, "collected": experiment.collected},
         **losses,
@@ -232,21 +237,27 @@ def bounds_report(config: Config) -> dict[str, Any]:
         "actual": actual,
         "fisher": whole.fisher,
         "qfi": whole.quantum,
-        "qfi_imaginary": experiment.collected * exact.imag / np.outer(per_step, per_step),
+        "qfi_imaginary": light.imag,
         "holevo": {"weight": "qfi", "sum": at_once.sum} | _named(free, at_once.sigma),
         "information_fraction": _named(PARAMETERS, information_fraction(whole)),
-        "information_fraction_joint": _named(free, (at_once.sigma / joint.crb_joint[index]) ** 2),
-        "incompatible": {"–".join(pair): v for pair, v in incompatible_pairs(exact).items()},
+        "information_fraction_joint": _named(free, shares),
+        "incompatible": {
+            "–".join(pair): v for pair, v in incompatible_pairs(experiment.quantum).items()
+        },
         "unidentifiable": [str(direction) for direction in joint.unidentifiable],
         "crosstalk": {
             "inflation": joint.inflation,
             "direction": dict(zip(free, joint.weakest, strict=False)),
         },
-        "convention": optics.convention,
-        "emission": optics.emission,
+        **picked(optics, "convention", "emission"),
         "warnings": [finding.text for finding in findings_of(experiment)],
         **({"rod": _with_angles(experiment, rod)} if isinstance(rod, Rod) else {}),
     }
+
+
+def picked(section: Any, *keys: str) -> dict[str, Any]:
+    """Take some keys of a section of a configuration."""
+    return {key: getattr(section, key) for key in keys}
 
 
 def _with_angles(experiment: Experiment, rod: Rod) -> dict[str, Any]:

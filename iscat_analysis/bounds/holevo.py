@@ -178,63 +178,34 @@ def _solve(information: ComplexArray, weight: FloatArray) -> FloatArray:
     size = len(weight)
     values, vectors = np.linalg.eigh(information / 4)
     light = np.sqrt(np.clip(values, 0.0, None))[:, None] * vectors.conj().T  # L
-    # The unknowns are the upper triangle of V, then Re X and Im X, row by row.
-    upper = [(i, j) for j in range(size) for i in range(j + 1)]
-    square = [(i, j) for i in range(size) for j in range(size)]
-    covariance = {pair: k for k, pair in enumerate(upper)}
-    real = {pair: len(upper) + k for k, pair in enumerate(square)}
-    imaginary = {pair: len(upper) + len(square) + k for k, pair in enumerate(square)}
-    unknowns = len(upper) + 2 * len(square)
-
-    # A Hermitian H = S + iT is positive where [[S, −T], [T, S]] is.  S = [[V, Re Xᵀ], [Re X, 1]],
-    # T = [[0, −Im Xᵀ], [Im X, 0]].  Its upper triangle goes to the solver column by column, off
-    # the diagonal times √2: constant − matrix·unknowns.
-    whole = 4 * size
-    place = {pair: k for k, pair in enumerate((i, j) for j in range(whole) for i in range(j + 1))}
-    entries: list[tuple[int, int, float]] = []
-    constant = np.zeros(len(place))
-
-    def put(row: int, column: int, unknown: int, factor: float) -> None:
-        if row <= column:
-            entries.append((place[row, column], unknown, -factor))
-
-    for first in (0, 2 * size):  # the two blocks S on the diagonal
-        for i, j in square:
-            put(first + i, first + j, covariance[min(i, j), max(i, j)], 1.0)
-            put(first + i, first + size + j, real[j, i], 1.0)
-        for i in range(size):
-            constant[place[first + size + i, first + size + i]] = 1.0
-    for i, j in square:  # −T above the diagonal: [[0, Im Xᵀ], [−Im X, 0]]
-        put(i, 3 * size + j, imaginary[j, i], 1.0)
-        put(size + i, 2 * size + j, imaginary[i, j], -1.0)
-    diagonal = np.array([row == column for row, column in place])
-    stretch = np.where(diagonal, 1.0, math.sqrt(2))
-    rows, columns, factors = (np.array(part) for part in zip(*entries, strict=True))
-    cone = sparse.csc_matrix((factors * stretch[rows], (rows, columns)), (len(place), unknowns))
-
-    # 2 Re(X†L) = 1: Σ_k Re X_ki Re L_kj + Im X_ki Im L_kj = δ_ij / 2
-    equal = np.zeros((size * size, unknowns))
-    for i, j in square:
-        for k in range(size):
-            equal[i * size + j, real[k, i]] += light[k, j].real
-            equal[i * size + j, imaginary[k, i]] += light[k, j].imag
-    cost = np.zeros(unknowns)
-    for i, j in upper:
-        cost[covariance[i, j]] = weight[i, j] * (1.0 if i == j else 2.0)
+    # The unknowns are the upper triangle of V, then Re X and Im X.  `v` and `x` are what each of
+    # them adds to V and X.
+    units = np.eye(size**2).reshape(-1, size, size)
+    symmetric = np.maximum(units, units.transpose(0, 2, 1))[
+        np.triu(np.ones((size, size))).ravel() > 0
+    ]
+    v = np.concatenate([symmetric, 0 * units, 0 * units])
+    x = np.concatenate([0 * symmetric, units, 1j * units])
+    # A Hermitian H = S + iT is positive where [[S, −T], [T, S]] is.  Its upper triangle goes to the
+    # solver column by column, off the diagonal times √2: constant − matrix·unknowns.
+    hermitian = np.block([[v, x.conj().transpose(0, 2, 1)], [x, 0 * x]])
+    real, imaginary = hermitian.real, hermitian.imag
+    columns, rows = np.tril_indices(4 * size)
+    stretch = np.where(rows == columns, 1.0, math.sqrt(2))
+    cone = -np.block([[real, -imaginary], [imaginary, real]])[:, rows, columns] * stretch
+    constant = np.diag(np.tile(np.repeat([0.0, 1.0], size), 2))[rows, columns]
+    equal = 2 * (x.conj().transpose(0, 2, 1) @ light).real.reshape(len(x), -1)  # 2 Re(X†L) = 1
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-9
     solution = clarabel.DefaultSolver(
-        sparse.csc_matrix((unknowns, unknowns)),
-        cost,
-        sparse.vstack([sparse.csc_matrix(equal), cone], format="csc"),
-        np.concatenate([np.eye(size).ravel() / 2, constant]),
-        [clarabel.ZeroConeT(size * size), clarabel.PSDTriangleConeT(whole)],
+        sparse.csc_matrix((len(x), len(x))),
+        (v * weight).sum(axis=(1, 2)),
+        sparse.csc_matrix(np.concatenate([equal, cone], axis=1).T),
+        np.concatenate([np.eye(size).ravel(), constant]),
+        [clarabel.ZeroConeT(size**2), clarabel.PSDTriangleConeT(4 * size)],
         settings,
     ).solve()
     if str(solution.status) not in ("Solved", "AlmostSolved"):
         raise ConfigError(f"the Holevo bound's solver stopped with {solution.status}")
-    found = np.zeros((size, size))
-    for i, j in upper:
-        found[i, j] = found[j, i] = solution.x[covariance[i, j]]
-    return found
+    return np.tensordot(solution.x, v, axes=1)

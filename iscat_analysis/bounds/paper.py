@@ -9,8 +9,9 @@ the stage when the particle moves, and are per collected photon, as the quantum 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, Literal
 
 import numpy as np
@@ -18,7 +19,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.pupil import make_pupil, rectangle
-from iscat_analysis.bounds.experiment import Experiment, plan
+from iscat_analysis.bounds.experiment import plan
 from iscat_analysis.bounds.quantum import Measure, quantum_bounds, quantum_information
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.optics.forward import ForwardModel, forward_model
@@ -69,6 +70,12 @@ FIGURE_4 = {
     "darkfield": (("4a", "4b"), ("4c", "4d")),
 }
 """Panels of Fig. 4 that show a scheme, over z and over focus; dark field is where both end."""
+
+PANELS = {
+    "2b": ("phase",), "2c": ("snr",), "2d": ("x", "y"), "2e": ("z",), "3": ("mass", "mass joint"),
+    "4a": ("z",), "4b": ("z",), "4c": ("mass",), "4d": ("mass",),
+}  # fmt: skip
+"""What each panel shows, as `point` names it."""
 
 TABLE_NODES = 100
 """Nodes per angle of the authors' rectangle rule for Table 1."""
@@ -122,16 +129,6 @@ def paper_config(
     )
 
 
-@dataclass(frozen=True)
-class Point:
-    """Bounds of one set-up, per photon."""
-
-    single: FloatArray
-    joint: FloatArray
-    phase: float
-    snr: float
-
-
 def photons_of_authors(scheme: str, attenuation: float | None = None) -> float:
     """Scattered photons on the field at z = focus = 0, the authors' normalisation."""
     return plan(
@@ -139,43 +136,38 @@ def photons_of_authors(scheme: str, attenuation: float | None = None) -> float:
     ).on_camera
 
 
-def point(config: Config, photons: float | None) -> Point:
-    """Bounds of one set-up, normalised as the figures are."""
-    return _point(plan(config), photons)
-
-
-def _point(experiment: Experiment, photons: float | None) -> Point:
+def point(config: Config, photons: float | None) -> dict[str, float]:
+    """Bounds of one set-up by quantity, normalised as the figures are; phase and signal on axis."""
+    experiment = plan(config)
+    model, z_nm, at = experiment.model, float(experiment.theta[2]), np.zeros(1)
     found = experiment.bounds(PARAMETERS)
-    per = np.array([1, 1, 1, 1 / experiment.mass_kda])
     root = math.sqrt(experiment.collected if photons is None else photons)
-    return Point(
-        found.crb_single * per * root, found.crb_joint * per * root, *_on_axis(experiment, root)
-    )
-
-
-def _on_axis(experiment: Experiment, root: float) -> tuple[float, float]:
-    model, z_nm = experiment.model, float(experiment.theta[2])
-    at = np.zeros(1)
+    per_photon = np.array([1, 1, 1, 1 / experiment.mass_kda]) * root
     along = complex(model.field(at, at, z_nm, experiment.mass_kda)[0, 0])
-    power, scale = abs(along) ** 2, float(experiment.likelihood.data[2, 0, 0])
-    signal = power + 2 * model.rho * along.real
-    noise = math.sqrt(model.rho + signal)
-    phase = math.atan2(along.imag, along.real) if model.rho else math.nan
-    return phase, signal / noise * math.sqrt(scale) / root
+    signal = abs(along) ** 2 + 2 * model.rho * along.real
+    scale = float(experiment.likelihood.data[2, 0, 0])
+    return {
+        **dict(zip(("x", "y", "z", "mass"), found.crb_single * per_photon, strict=True)),
+        "mass joint": (found.crb_joint * per_photon)[3],
+        "phase": math.atan2(along.imag, along.real) if model.rho else math.nan,
+        "snr": signal / math.sqrt(model.rho + signal) * math.sqrt(scale) / root,
+    }
 
 
 def reproduce(*, progress: Progress = silent) -> Reproduction:
     """Compute every panel and Table 1."""
-    jobs: list[tuple[tuple[str, ...], str, Convention, float | None]] = []
+    jobs: list[tuple[tuple[str, ...], str, Convention, float]] = []
     conventions: tuple[Convention, ...] = ("dong2021", "exact")
-    for convention in conventions:
-        for scheme in SCHEMES:
-            over_z, over_focus = FIGURE_4[scheme]
-            jobs.append((("2b", "2c", "2d", "2e", *over_z), scheme, convention, None))
-            jobs.append((("3", *over_focus), scheme, convention, None))
-            for attenuation in ATTENUATIONS[scheme][1:]:
-                jobs.append((over_z, scheme, convention, attenuation))
-                jobs.append((over_focus, scheme, convention, attenuation))
+    for convention, scheme in product(conventions, SCHEMES):
+        over_z, over_focus = FIGURE_4[scheme]
+        first, *others = ATTENUATIONS[scheme]
+        jobs.append((("2b", "2c", "2d", "2e", *over_z), scheme, convention, first))
+        jobs.append((("3", *over_focus), scheme, convention, first))
+        jobs += [
+            (panels, scheme, convention, attenuation)
+            for attenuation in others
+            for panels in (over_z, over_focus)
+        ]
     parts: list[pd.DataFrame] = []
     with threads(2) as pool:
         for done, part in enumerate(pool.map(lambda job: _curves(*job), jobs), start=1):
@@ -184,59 +176,33 @@ def reproduce(*, progress: Progress = silent) -> Reproduction:
     images = {(scheme, z): _intensity(scheme, z) for scheme in SCHEMES for z in IMAGE_HEIGHTS_NM}
     measures: tuple[Measure, ...] = ("dong2021", "exact")
     quantum: dict[tuple[str, str], FloatArray] = {
-        (measure, scheme): quantum_bounds(
-            quantum_information(_model(scheme), HEIGHT_NM, measure=measure)
-        )[0]
-        for measure in measures
-        for scheme in SCHEMES
+        (measure, scheme): _single(_model(scheme), measure)
+        for measure, scheme in product(measures, SCHEMES)
     }
     return Reproduction(pd.concat(parts, ignore_index=True), images, table1(), quantum)
 
 
 def _curves(
-    panels: tuple[str, ...], scheme: str, convention: Convention, attenuation: float | None
+    panels: tuple[str, ...], scheme: str, convention: Convention, attenuation: float
 ) -> pd.DataFrame:
     over_z = panels[0] in ("2b", "4a", "4b")
     photons = photons_of_authors(scheme, attenuation) if convention == "dong2021" else None
     axis = HEIGHTS_NM if over_z else FOCI_NM
-    points = []
-    for value in axis:
-        config = paper_config(
-            scheme,
-            convention,
-            z_nm=value if over_z else HEIGHT_NM,
-            focus_nm=FOCUS_NM if over_z else value,
-            attenuation=attenuation,
+    places = ((value, FOCUS_NM) if over_z else (HEIGHT_NM, value) for value in axis)
+    points = pd.DataFrame(
+        point(
+            paper_config(scheme, convention, z_nm=z, focus_nm=focus, attenuation=attenuation),
+            photons,
         )
-        points.append(_point(plan(config), photons))
-    single = np.array([p.single for p in points])
-    joint = np.array([p.joint for p in points])
-    quantities: dict[str, list[tuple[str, FloatArray]]] = {
-        "2b": [("phase", np.unwrap([p.phase for p in points]))],
-        "2c": [("snr", np.array([p.snr for p in points]))],
-        "2d": [("x", single[:, 0]), ("y", single[:, 1])],
-        "2e": [("z", single[:, 2])],
-        "3": [("mass", single[:, 3]), ("mass joint", joint[:, 3])],
-        "4a": [("z", single[:, 2])],
-        "4b": [("z", single[:, 2])],
-        "4c": [("mass", single[:, 3])],
-        "4d": [("mass", single[:, 3])],
-    }
+        for z, focus in places
+    )
+    points["phase"] = np.unwrap(points["phase"])
+    common = {"scheme": scheme, "convention": convention, "attenuation": attenuation}
     frames = [
-        pd.DataFrame(
-            {
-                "panel": panel,
-                "scheme": scheme,
-                "convention": convention,
-                "attenuation": ATTENUATIONS[scheme][0] if attenuation is None else attenuation,
-                "quantity": name,
-                "x": axis,
-                "value": values,
-            }
-        )
+        pd.DataFrame({"panel": panel, **common, "quantity": name, "x": axis, "value": points[name]})
         for panel in panels
         if not (panel == "2b" and scheme == "darkfield")
-        for name, values in quantities[panel]
+        for name in PANELS[panel]
     ]
     return pd.concat(frames, ignore_index=True)
 
@@ -256,26 +222,20 @@ def _model(scheme: str, emission: str = "dong2021") -> ForwardModel:
 
 def table1() -> pd.DataFrame:
     """Make Table 1: quantum bounds per collected photon, five ways."""
-    conventions = {
-        "authors": {s: rectangle_rule_bounds(s) for s in ("iscat", "cobri")},
-        "dong2021": {s: _single(_model(s), "dong2021") for s in ("iscat", "cobri")},
-        "exact": {s: _single(_model(s), "exact") for s in ("iscat", "cobri")},
-        "reciprocal": {
-            s: _single(_model(s, emission="reciprocal"), "exact") for s in ("iscat", "cobri")
-        },
+    ways: dict[str, Callable[[str], FloatArray]] = {
+        "authors": rectangle_rule_bounds,
+        "dong2021": lambda scheme: _single(_model(scheme), "dong2021"),
+        "exact": lambda scheme: _single(_model(scheme), "exact"),
+        "reciprocal": lambda scheme: _single(_model(scheme, emission="reciprocal"), "exact"),
     }
+    found = {way: {s: of(s) for s in ("iscat", "cobri")} for way, of in ways.items()}
     rows = []
-    for name, unit, index, scheme in (
-        ("x", "nm", 0, "iscat"),
-        ("y", "nm", 1, "iscat"),
-        ("z_iscat", "nm", 2, "iscat"),
-        ("z_cobri", "nm", 2, "cobri"),
-        ("mass", "relative", 3, "iscat"),
-    ):
-        row: dict[str, Any] = {"quantity": name, "unit": unit, "printed": PRINTED[name]}
-        rows.append(
-            row | {convention: found[scheme][index] for convention, found in conventions.items()}
-        )
+    for name, printed in PRINTED.items():
+        quantity, _, scheme = name.partition("_")
+        at = ("x", "y", "z", "mass").index(quantity)
+        unit = "relative" if quantity == "mass" else "nm"
+        row: dict[str, Any] = {"quantity": name, "unit": unit, "printed": printed}
+        rows.append(row | {way: of[scheme or "iscat"][at] for way, of in found.items()})
     return pd.DataFrame(rows)
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import re
+from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -23,7 +24,14 @@ from numba import get_num_threads
 from pydantic import ValidationError
 
 from iscat_analysis.bounds.classical import bounds_from_matrices
-from iscat_analysis.bounds.experiment import Experiment, detector, information_fraction, plan
+from iscat_analysis.bounds.experiment import (
+    Experiment,
+    detector,
+    height_of,
+    information_fraction,
+    plan,
+    reach_of,
+)
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.forward import MassScale, forward_model
@@ -52,9 +60,11 @@ def _pixel_nm(config: Config) -> float:
     return detector(config)[0]
 
 
-def _height(config: Config) -> float:
-    z_nm = config.bounds.z_nm
-    return config.particle.nominal_height_nm if z_nm is None else z_nm
+def _key(
+    section: str, key: str
+) -> tuple[Callable[[Config], float], Callable[[Config, float], Mapping[str, Mapping[str, Any]]]]:
+    """Give what reads one key of a section, and what changes it."""
+    return lambda c: getattr(getattr(c, section), key), lambda _, v: {section: {key: v}}
 
 
 def _attenuated(config: Config, value: float) -> Mapping[str, Mapping[str, Any]]:
@@ -84,33 +94,23 @@ def _field(config: Config, value: float) -> Mapping[str, Mapping[str, Any]]:
     return {"bounds": {"pixels": round(value / _pixel_nm(config))}}
 
 
+_ATTENUATION, _PHOTONS = (
+    "amplitude of the reference that passes",
+    "background photons per pixel and frame",
+)
+
 AXES = {
     axis.name: axis
     for axis in (
-        Axis("z", "height z [nm]", _height, lambda _, v: {"bounds": {"z_nm": v}}, False),
-        Axis(
-            "focus", "focus height [nm]", lambda c: c.optics.focus_nm,
-            lambda _, v: {"optics": {"focus_nm": v}}, True,
-        ),
-        Axis(
-            "attenuation", "amplitude of the reference that passes",
-            lambda c: c.optics.attenuation, _attenuated, True,
-        ),
-        Axis(
-            "na", "numerical aperture", lambda c: c.optics.na,
-            lambda _, v: {"optics": {"na": v}}, True,
-        ),
+        Axis("z", "height z [nm]", height_of, _key("bounds", "z_nm")[1], False),
+        Axis("focus", "focus height [nm]", *_key("optics", "focus_nm"), True),
+        Axis("attenuation", _ATTENUATION, _key("optics", "attenuation")[0], _attenuated, True),
+        Axis("na", "numerical aperture", *_key("optics", "na"), True),
         Axis("pixel", "pixel size [nm]", _pixel_nm, _pixelated, False),
-        Axis(
-            "fov", "field of view [nm]", lambda c: c.bounds.pixels * _pixel_nm(c), _field, False
-        ),
-        Axis(
-            "photons", "background photons per pixel and frame",
-            lambda c: c.bounds.photons_per_pixel,
-            lambda _, v: {"bounds": {"photons_per_pixel": v}}, False,
-        ),
+        Axis("fov", "field of view [nm]", lambda c: c.bounds.pixels * _pixel_nm(c), _field, False),
+        Axis("photons", _PHOTONS, *_key("bounds", "photons_per_pixel"), False),
     )
-}  # fmt: skip
+}
 """What `--scan` knows."""
 
 
@@ -132,56 +132,59 @@ def parse_scan(text: str) -> tuple[Axis, FloatArray]:
     """
     name, equals, numbers = text.partition("=")
     name = name.strip().lower()
+
+    def refused(why: str) -> ConfigError:
+        return ConfigError(f"`scan` = {text}: {why}")
+
     if not equals or name not in AXES:
-        raise ConfigError(
-            f"`scan` = {text}: write it as NAME=start:stop:step or NAME=a,b,c, "
-            f"with NAME one of {', '.join(AXES)}; as in `scan` = z=0:2000:50"
+        raise refused(
+            "write it as NAME=start:stop:step or NAME=a,b,c, with NAME one of "
+            f"{', '.join(AXES)}; as in `scan` = z=0:2000:50"
         )
+    example = f"as in `scan` = {name}=0:2000:50"
     try:
         parts = [float(part) for part in numbers.replace(",", ":").split(":")]
     except ValueError:
-        raise ConfigError(
-            f"`scan` = {text}: {numbers!r} is not start:stop:step nor a,b,c; "
-            f"as in `scan` = {name}=0:2000:50"
-        ) from None
+        raise refused(f"{numbers!r} is not start:stop:step nor a,b,c; {example}") from None
     if not all(map(math.isfinite, parts)):
-        raise ConfigError(f"`scan` = {text}: needs finite numbers")
+        raise refused("needs finite numbers")
     if ":" not in numbers:
         return AXES[name], np.array(parts)
     if "," in numbers or len(parts) != 3:
-        raise ConfigError(
-            f"`scan` = {text}: needs three numbers start:stop:step, as in `scan` = {name}=0:2000:50"
-        )
+        raise refused(f"needs three numbers start:stop:step, {example}")
     start, stop, step = parts
     if step == 0 or (stop - start) / step < 0:
-        raise ConfigError(
-            f"`scan` = {text}: the step {step:g} does not lead from {start:g} to {stop:g}; "
-            "change its sign or size"
+        raise refused(
+            f"the step {step:g} does not lead from {start:g} to {stop:g}; change its sign or size"
         )
     count = math.floor((stop - start) / step * (1 + 1e-12) + 1e-9) + 1
     if count > MAX_POINTS:
-        raise ConfigError(
-            f"`scan` = {text}: has {count} points, at most {MAX_POINTS}; take a larger step"
-        )
+        raise refused(f"has {count} points, at most {MAX_POINTS}; take a larger step")
     return AXES[name], np.array([start + step * i for i in range(count)])
 
 
 def changed(config: Config, axis: Axis, value: float) -> Config:
     """Move a configuration along an axis."""
-    changes = axis.change(config, float(value))
+    return with_keys(config, axis.change(config, float(value)), where=f"{axis.name} = {value:g}")
+
+
+def with_keys(
+    config: Config, sections: Mapping[str, Mapping[str, Any]], *, where: str = "configuration"
+) -> Config:
+    """Replace keys of sections of a configuration, which are checked again."""
     try:
         return config.model_copy(
             update={
-                name: type(section).model_validate({**section.model_dump(), **changes[name]})
-                for name in changes
+                name: type(section).model_validate({**section.model_dump(), **keys})
+                for name, keys in sections.items()
                 if (section := getattr(config, name)) is not None
             }
         )
     except ValidationError:  # again, as a whole, for a message that names the key
         values = config.model_dump(exclude_none=True)
-        for name, keys in changes.items():
+        for name, keys in sections.items():
             values.setdefault(name, {}).update(keys)
-        return parse_config(values, where=f"{axis.name} = {value:g}")
+        return parse_config(values, where=where)
 
 
 def scan(config: Config, axis: Axis, values: FloatArray, *, progress: Progress = silent) -> Scan:
@@ -194,11 +197,9 @@ def scan(config: Config, axis: Axis, values: FloatArray, *, progress: Progress =
     plans = [changed(config, axis, value) for value in values]
     model = None
     if not axis.rebuilds:
-        reach = max(_reach(one) for one in plans)
-        heights = [_height(one) for one in plans]
-        model = forward_model(
-            config, reach, z_max_nm=max(*heights, config.particle.nominal_height_nm)
-        )
+        heights = [height_of(one) for one in plans]
+        highest = max(*heights, config.particle.nominal_height_nm)
+        model = forward_model(config, max(map(reach_of, plans)), z_max_nm=highest)
         model = replace(model, z_range_nm=(min(heights), max(heights)))
 
     def stretch(part: list[Config]) -> list[dict[str, Any]]:
@@ -220,23 +221,20 @@ def calibrated_scale(config: Config) -> MassScale | None:
     return plan(config).model.scale if config.calibration is not None else None
 
 
-def _reach(config: Config) -> float:
-    half = config.bounds.pixels * _pixel_nm(config) / 2
-    return 1.0001 * math.hypot(half + abs(config.bounds.x_nm), half + abs(config.bounds.y_nm))
-
-
 def _row(experiment: Experiment, free: tuple[str, ...]) -> dict[str, Any]:
     whole = experiment.bounds(PARAMETERS)
     joint = bounds_from_matrices(whole.fisher, whole.quantum, free)
-    fraction = information_fraction(whole)
-    row: dict[str, Any] = {}
-    for kind, values in (
-        ("crb_single", whole.crb_single),
-        ("crb_joint", joint.crb_joint),
-        ("qcrb", whole.qcrb),
-        ("information", fraction),
-    ):
-        row |= {f"{kind}_{name}": v for name, v in zip(PARAMETERS, values, strict=True)}
+    kinds = {
+        "crb_single": whole.crb_single,
+        "crb_joint": joint.crb_joint,
+        "qcrb": whole.qcrb,
+        "information": information_fraction(whole),
+    }
+    row: dict[str, Any] = {
+        f"{kind}_{name}": value
+        for kind, values in kinds.items()
+        for name, value in zip(PARAMETERS, values, strict=True)
+    }
     return row | {
         "n_camera": experiment.on_camera,
         "n_collected": experiment.collected,
@@ -259,7 +257,7 @@ FOCUS_STEP_NM = 25.0
 ATTENUATION_DECADES = 4
 """Attenuations searched below 1."""
 
-MAX_FRAMES = 1e12
+MAX_FRAMES = 10**12
 """More frames than any experiment has."""
 
 
@@ -382,37 +380,26 @@ def effort(config: Config, goal: Goal) -> list[Effort]:
 
 
 def _effort(config: Config, goal: Goal, name: str, before: Callable[[int], int]) -> Effort:
-    def bound(n_after: int) -> float:
-        return _bound(
-            with_keys(config, {"bounds": {"n_after": n_after, "n_before": before(n_after)}}), goal
-        )
+    at, model = PARAMETERS.index(goal.parameter), plan(config).model
 
-    one = bound(1)
-    if not math.isfinite(one):
+    def planned(n_after: int) -> Experiment:
+        frames = {"n_after": n_after, "n_before": before(n_after)}
+        return plan(with_keys(config, {"bounds": frames}), model=model)
+
+    def bound(n_after: int) -> float:
+        return float(planned(n_after).bounds(FREE_PARAMETERS[config.fit.mode]).crb_joint[at])
+
+    if not math.isfinite(bound(1)):
         raise ConfigError(
             f"`target`: {goal.parameter} is unidentifiable here; change the focus or free fewer "
             "parameters with fit.mode"
         )
-    if bound(int(MAX_FRAMES)) > goal.value:
+    if bound(MAX_FRAMES) > goal.value:
         return Effort(name, before(0), math.inf, None, math.inf)
-    frames = 1
-    if one > goal.value:
-        root = scipy.optimize.brentq(
-            lambda t: bound(max(1, round(math.exp(t)))) / goal.value - 1,
-            0.0,
-            math.log(MAX_FRAMES),
-            xtol=1e-3,
-        )
-        frames = max(1, round(math.exp(root)))
-        step = max(1, round(frames * 1e-4))
-        while bound(frames) > goal.value:
-            frames += step
-        while frames > step and bound(frames - step) <= goal.value:
-            frames -= step
-    reached = plan(with_keys(config, {"bounds": {"n_after": frames, "n_before": before(frames)}}))
+    frames = 1 + bisect_left(range(1, MAX_FRAMES), True, key=lambda n: bound(n) <= goal.value)
     rate = config.camera.frame_rate_hz
     seconds = (frames + before(frames)) / rate if rate else None
-    return Effort(name, before(frames), frames, seconds, reached.collected)
+    return Effort(name, before(frames), frames, seconds, planned(frames).collected)
 
 
 @dataclass(frozen=True)
@@ -451,27 +438,12 @@ def budget(config: Config, parameter: str) -> list[Cost]:
 
 def _refined(config: Config) -> Mapping[str, Mapping[str, Any]]:
     """Divide the same field into pixels so small that they cost nothing."""
-    pixel = config.camera.pixel_size_nm
-    if pixel is None:
-        return {}
+    pixel = _pixel_nm(config)
     # Fine pixels per wavelength over NA; finer ones change no bound by 1e-4
     wanted = math.ceil(pixel * 24 * config.optics.na / config.optics.wavelength_nm)
     # Side of the finest field
     split = max(1, min(wanted, 1200 // config.bounds.pixels))
     return _pixelated(config, pixel / split)
-
-
-def with_keys(config: Config, sections: Mapping[str, Mapping[str, Any]]) -> Config:
-    """Replace keys of sections of a configuration, which is checked again."""
-    values = config.model_dump(exclude_none=True)
-    for section, keys in sections.items():
-        values.setdefault(section, {}).update(keys)
-    return parse_config(values)
-
-
-def _bound(config: Config, goal: Goal) -> float:
-    free = FREE_PARAMETERS[config.fit.mode]
-    return float(plan(config).bounds(free).crb_joint[PARAMETERS.index(goal.parameter)])
 
 
 def parse_names(text: str | None, config: Config) -> list[str] | None:

@@ -22,7 +22,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -33,9 +34,11 @@ from iscat_analysis.bounds.experiment import Experiment, plan
 from iscat_analysis.bounds.holevo import Holevo, holevo_bound
 from iscat_analysis.bounds.planning import calibrated_scale, with_keys
 from iscat_analysis.bounds.quantum import transmitted_over_collected
-from iscat_analysis.config import Config, Optics
+from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.forward import MassScale
+from iscat_analysis.optics.local import terms_of
+from iscat_analysis.optics.parameters import Settings, settings_of, with_settings
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Progress, silent
 
 ROUND_TERMS, OTHER_TERMS = ("z11",), ("z5", "z6", "z7", "z8", "z9", "z10")
@@ -62,8 +65,43 @@ term, a factor e of attenuation, the whole aperture for the mask."""
 NO_BOUND = 50.0
 """ln F of a pupil that does not identify the parameters or saturates the camera."""
 
-_DIGITS = {"focus_nm": 1, "reference_phase_deg": 1, "mask_na": 3}  # of what is written; others 1
-_UNIT_FOCUS_NM = 500.0
+Ends = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class _Knob:
+    """A variable of the search: its unit, where it is sampled, and how far it may go."""
+
+    encode: Callable[[float], float]
+    decode: Callable[[float], float]
+    sampled: Ends
+    allowed: Ends
+
+
+def _linear(middle: float, unit: float, sampled: Ends, allowed: Ends) -> _Knob:
+    return _Knob(lambda v: (v - middle) / unit, lambda u: middle + unit * u, sampled, allowed)
+
+
+def knobs_of(config: Config) -> dict[str, _Knob]:
+    """Give the variables by their keys."""
+    optics, height, turn = config.optics, config.particle.nominal_height_nm, 2 * math.pi
+    term = _linear(0.0, optics.wavelength_nm / 20.0, (-2.0, 2.0), (-8.0, 8.0))
+    phase = _Knob(
+        math.radians,
+        lambda u: math.degrees(math.remainder(u, turn)),
+        (-turn / 2, turn / 2),
+        (-1.5 * turn, 1.5 * turn),
+    )
+    dimmest = math.log(3e-3), math.log(1e-4)
+    return {
+        "focus_nm": _linear(height, 500.0, (-4.0, 4.0), (-4.0, 4.0)),
+        "reference_phase_deg": phase,
+        "attenuation": _Knob(
+            math.log, lambda u: math.exp(min(u, 0.0)), (dimmest[0], 0.0), (dimmest[1], 0.0)
+        ),
+        "mask_na": _linear(0.0, optics.na, (0.1, 0.95), (0.05, 0.99)),
+        **dict.fromkeys((*ROUND_TERMS, *OTHER_TERMS), term),
+    }
 
 
 @dataclass
@@ -75,157 +113,118 @@ class Search:
     chosen: tuple[str, ...]
     free: tuple[str, ...]
     evaluations: int = 0
-    keys: tuple[str, ...] = field(init=False)
 
-    def __post_init__(self) -> None:
-        self.keys = tuple(key for name in KNOBS if name in self.free for key in KNOBS[name])
+    @cached_property
+    def knobs(self) -> dict[str, _Knob]:
+        """The variables that may change."""
+        every = knobs_of(self.config)
+        return {key: every[key] for name in KNOBS if name in self.free for key in KNOBS[name]}
 
-    def config_of(self, optics: Optics) -> Config:
+    @cached_property
+    def start(self) -> Settings:
+        """The configured optics."""
+        return settings_of(self.config) | terms_of(self.config.optics)
+
+    def config_of(self, settings: Settings) -> Config:
         """Experiment with other optics and the same light on the particle."""
-        power = (optics.attenuation / self.config.optics.attenuation) ** 2
+        power = (settings["attenuation"] / self.start["attenuation"]) ** 2
         photons = self.config.bounds.photons_per_pixel * power
-        return self.config.model_copy(
-            update={
-                "optics": optics,
-                "bounds": self.config.bounds.model_copy(update={"photons_per_pixel": photons}),
-            }
-        )
+        bounds = self.config.bounds.model_copy(update={"photons_per_pixel": photons})
+        optics = with_settings(self.config, settings).optics
+        optics = optics.model_copy(update={"file": None, "covariance": None})
+        return self.config.model_copy(update={"optics": optics, "bounds": bounds})
 
-    def value(self, optics: Optics) -> tuple[float, Optics]:
+    def value(self, settings: Settings) -> tuple[float, Settings]:
         """Compute ln F and the optics, dimmed where the well depth requires it."""
         # Share of the well that the brightest pixel may expect
         largest_e = 0.99 * (self.config.camera.well_depth_e or math.inf)
         for _ in range(4):
             self.evaluations += 1
-            experiment = plan(self.config_of(optics), scale=self.scale)
+            experiment = plan(self.config_of(settings), scale=self.scale)
             if experiment.peak_e <= largest_e:
-                sigma, own = sigmas(experiment)
-                at = [PARAMETERS.index(name) for name in self.chosen]
-                total = float(np.sum((sigma[at] / own[at]) ** 2))
-                return (math.log(total) if math.isfinite(total) else NO_BOUND), optics
+                total = total_of(experiment, self.chosen)
+                return (math.log(total) if math.isfinite(total) else NO_BOUND), settings
             if "attenuation" not in self.free:
                 break
-            dimmed = optics.attenuation * math.sqrt(0.99 * largest_e / experiment.peak_e)
-            optics = optics.model_copy(update={"attenuation": dimmed})
-        return NO_BOUND, optics
+            dimmed = settings["attenuation"] * math.sqrt(0.99 * largest_e / experiment.peak_e)
+            settings = {**settings, "attenuation": dimmed}
+        return NO_BOUND, settings
 
     def valleys(self, starts: int, seed: int) -> list[tuple[list[str], FloatArray]]:
         """Choose starts: the configured pupil, and the best of a sample with and without mask."""
-        keys = [key for key in self.keys if key not in OTHER_TERMS]
+        keys = [key for key in self.knobs if key not in OTHER_TERMS]
         bare = [key for key in keys if key != "mask_na"]
-        here = self.config.optics
-        first = keys if here.mask_na else bare
-        chosen = [(first, self.encode(first, here))]
+        first = keys if self.start["mask_na"] else bare
+        chosen = [(first, self.encode(first, self.start))]
         for number, names in enumerate([bare] if bare == keys else [bare, keys]):
             if not names:
                 continue
             rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0, number)))
-            low, high = np.array([self.range(key)[0] for key in names]).T
-            # Random pupils for each variable, with and without mask, from which the valleys are
-            # chosen
+            low, high = np.array([self.knobs[key].sampled for key in names]).T
+            # Random pupils for each variable, from which the valleys are chosen
             points = low + (high - low) * rng.random((128 * len(names), len(names)))
             values = [self.value(self.decode(names, point))[0] for point in points]
             distinct: list[FloatArray] = []
             for point in points[np.argsort(values)]:
-                if len(distinct) < starts and all(
-                    # Smallest distance between starts, in these units
-                    np.linalg.norm(point - p) > 0.5
-                    for p in distinct
-                ):
+                # Smallest distance between starts, in these units
+                if all(np.linalg.norm(point - other) > 0.5 for other in distinct):
                     distinct.append(point)
-            chosen += [(names, point) for point in distinct]
+            chosen += [(names, point) for point in distinct[:starts]]
         return chosen
 
-    def descend(self, keys: list[str], start: FloatArray) -> tuple[float, Optics]:
+    def descend(self, keys: list[str], start: FloatArray) -> tuple[float, Settings]:
         """Find the lowest point near a start: ln F and the optics."""
         if not keys:
             return self.value(self.decode(keys, start))
-        low, high = np.array([self.range(key)[1] for key in keys]).T
-        found = scipy.optimize.minimize(
-            lambda point: self.value(self.decode(keys, point))[0],
-            np.clip(start, low, high),
-            bounds=list(zip(low, high, strict=True)),
-            method="COBYQA",
-            options={
-                "maxfev": BUDGET * len(keys),
-                "initial_tr_radius": RADII[0],
-                "final_tr_radius": RADII[1],
-            },
-        )
+
+        def at(point: FloatArray) -> float:
+            return self.value(self.decode(keys, point))[0]
+
+        limits = [self.knobs[key].allowed for key in keys]
+        first, last = RADII
+        options = {"initial_tr_radius": first, "final_tr_radius": last}
+        options["maxfev"] = BUDGET * len(keys)
+        begin = np.clip(start, *np.transpose(limits))
+        found = scipy.optimize.minimize(at, begin, bounds=limits, method="COBYQA", options=options)
         return self.value(self.decode(keys, found.x))
 
-    def simplified(self, best: Optics) -> tuple[float, Optics]:
+    def simplified(self, best: Settings) -> tuple[float, Settings]:
         """Round the settings, and undo those that change nothing."""
-        best = self._with(
-            best, {key: _rounded(key, setting(best, key)) for key in self.keys if key != "mask_na"
-                   or best.mask_na}
-        )  # fmt: skip
-        value, best = self.value(best)
+        changed = [key for key in self.knobs if key != "mask_na" or best["mask_na"]]
+        value, best = self.value({**best, **{key: _rounded(key, best[key]) for key in changed}})
         # Relative change of F below which a knob returns to where it was configured: simpler is
         # better
         worst = value + 1e-4
-        for key in reversed(self.keys):
-            here = setting(self.config.optics, key)
-            if setting(best, key) != here:
-                simpler = self.value(self._with(best, {key: here}))
-                if simpler[0] <= worst and simpler[1].attenuation <= best.attenuation:
+        for key in reversed(self.knobs):
+            if best[key] != self.start[key]:
+                simpler = self.value({**best, key: self.start[key]})
+                if simpler[0] <= worst and simpler[1]["attenuation"] <= best["attenuation"]:
                     value, best = simpler
         return value, best
 
-    def range(self, key: str) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Where a knob is sampled, and how far it may go."""
-        return {
-            "focus_nm": ((-4.0, 4.0), (-4.0, 4.0)),
-            "reference_phase_deg": ((-math.pi, math.pi), (-3 * math.pi, 3 * math.pi)),
-            "attenuation": ((math.log(3e-3), 0.0), (math.log(1e-4), 0.0)),
-            "mask_na": ((0.1, 0.95), (0.05, 0.99)),
-        }.get(key, ((-2.0, 2.0), (-8.0, 8.0)))
-
-    def encode(self, keys: Sequence[str], optics: Optics) -> FloatArray:
+    def encode(self, keys: Sequence[str], settings: Settings) -> FloatArray:
         """Optics → point of the search."""
-        return np.array([self._coding(key)[0](setting(optics, key)) for key in keys])
+        return np.array([self.knobs[key].encode(settings[key]) for key in keys])
 
-    def decode(self, keys: Sequence[str], point: FloatArray) -> Optics:
+    def decode(self, keys: Sequence[str], point: FloatArray) -> Settings:
         """Point of the search → optics; a mask that is not among the keys is taken out."""
-        changes = {key: self._coding(key)[1](float(u)) for key, u in zip(keys, point, strict=True)}
-        if "mask_na" in self.keys and "mask_na" not in keys:
-            changes["mask_na"] = 0.0
-        return self._with(self.config.optics, changes)
-
-    def _coding(self, key: str) -> tuple[Callable[[float], float], Callable[[float], float]]:
-        optics, height = self.config.optics, self.config.particle.nominal_height_nm
-        # a unit of a Zernike term is a twentieth of the wavelength
-        wave = optics.wavelength_nm / 20.0
-        if key == "focus_nm":
-            return (lambda v: (v - height) / _UNIT_FOCUS_NM, lambda u: height + _UNIT_FOCUS_NM * u)
-        if key == "reference_phase_deg":
-            return math.radians, lambda u: math.degrees(math.remainder(u, 2 * math.pi))
-        if key == "attenuation":
-            return math.log, lambda u: math.exp(min(u, 0.0))
-        if key == "mask_na":
-            return lambda v: v / optics.na, lambda u: u * optics.na
-        return lambda v: v / wave, lambda u: u * wave
-
-    def _with(self, optics: Optics, changes: Mapping[str, float]) -> Optics:
-        terms = {k: v for k, v in changes.items() if k not in Optics.model_fields}
-        update: dict[str, Any] = {k: v for k, v in changes.items() if k not in terms}
-        if terms:
-            distinct = {k: v for k, v in (optics.aberrations_nm | terms).items() if v}
-            update["aberrations_nm"] = distinct
-        return optics.model_copy(update=update | {"file": None, "covariance": None})
-
-
-def setting(optics: Optics, key: str) -> float:
-    """Give the value of a key of the optics, or of a Zernike term."""
-    if key in Optics.model_fields:
-        return float(getattr(optics, key))
-    return optics.aberrations_nm.get(key, 0.0)
+        moved = zip(keys, point.tolist(), strict=True)
+        bare = {"mask_na": 0.0} if "mask_na" in self.knobs else {}
+        return {**self.start, **bare, **{key: self.knobs[key].decode(u) for key, u in moved}}
 
 
 def _rounded(key: str, value: float) -> float:
+    """Round a setting to the digits that are written."""
     if key == "attenuation":
         return float(f"{value:.3g}")
-    return round(value, _DIGITS.get(key, 1)) + 0.0
+    return round(value, 3 if key == "mask_na" else 1) + 0.0
+
+
+def total_of(experiment: Experiment, chosen: Sequence[str]) -> float:
+    """F of one pupil: squared joint bounds of the chosen parameters over their quantum bounds."""
+    at = [PARAMETERS.index(name) for name in chosen]
+    joint, own = sigmas(experiment)
+    return float(np.sum((joint[at] / own[at]) ** 2))
 
 
 def sigmas(experiment: Experiment) -> tuple[FloatArray, FloatArray]:
@@ -245,28 +244,22 @@ class PupilOptimum:
     config: Config
     chosen: tuple[str, ...]
     settings: Mapping[str, tuple[float, float]]
-    sigma: Mapping[str, float]
-    sigma_configured: Mapping[str, float]
-    sigma_holevo: Mapping[str, float]
-    sigma_quantum: Mapping[str, float]
-    sum: float
-    sum_configured: float
+    sigma: Mapping[str, Mapping[str, float]]
+    """Of every chosen parameter: configured, best, holevo, qcrb."""
+
+    sums: Mapping[str, float]
+    """F: configured, best, and that of the best pupil with a quiet camera."""
+
     holevo: float
-    share_quiet: float
     transmitted: float
     peak_e: float
     descents: tuple[float, ...]
     evaluations: int
 
     @property
-    def share(self) -> float:
-        """C_H/F: how near the best pupil comes to the Holevo bound, at most 1."""
-        return self.holevo / self.sum
-
-    @property
-    def share_configured(self) -> float:
-        """C_H/F as configured."""
-        return self.holevo / self.sum_configured
+    def shares(self) -> dict[str, float]:
+        """C_H/F: how near each comes to the Holevo bound, at most 1."""
+        return {kind: self.holevo / total for kind, total in self.sums.items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Give what ``iscat bounds --json`` has under ``pupil``."""
@@ -279,25 +272,16 @@ class PupilOptimum:
             "photons_per_pixel": self.config.bounds.photons_per_pixel,
             "peak_e": self.peak_e,
             "transmitted_over_collected": self.transmitted,
-            "sigma": {
-                name: {
-                    "configured": self.sigma_configured[name],
-                    "best": self.sigma[name],
-                    "holevo": self.sigma_holevo[name],
-                    "qcrb": self.sigma_quantum[name],
-                }
-                for name in self.chosen
-            },
-            "sum": {"configured": self.sum_configured, "best": self.sum, "holevo": self.holevo},
-            "share": {
-                "configured": self.share_configured,
-                "best": self.share,
-                "quiet": self.share_quiet,
-            },
+            "sigma": self.sigma,
+            "sum": {**{kind: self.sums[kind] for kind in _ENDS}, "holevo": self.holevo},
+            "share": self.shares,
             "descents": list(self.descents),
             "near": sum(share > 0.99 * self.descents[0] for share in self.descents),
             "evaluations": self.evaluations,
         }
+
+
+_ENDS = ("configured", "best")
 
 
 def optimize_pupil(
@@ -316,8 +300,8 @@ def optimize_pupil(
     light = _holevo(plan(config), chosen)
     search = Search(_cropped(config), scale, chosen, free)
     log_holevo = math.log(light.sum)
-    others = [key for key in OTHER_TERMS if key in search.keys]
-    found: list[tuple[float, Optics]] = []
+    others = [key for key in OTHER_TERMS if key in search.knobs]
+    found: list[tuple[float, Settings]] = []
     valleys = search.valleys(starts, seed)
     for done, (keys, start) in enumerate(valleys):
         found.append(search.descend(keys, start))
@@ -325,65 +309,51 @@ def optimize_pupil(
     found.sort(key=lambda item: item[0])
     if others:
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
-        optics = found[0][1]
-        keys = [key for key in search.keys if key != "mask_na" or optics.mask_na]
-        start = search.encode(keys, optics)
+        settings = found[0][1]
+        keys = [key for key in search.knobs if key != "mask_na" or settings["mask_na"]]
+        start = search.encode(keys, settings)
         start += np.where([key in others for key in keys], rng.normal(0, 0.3, len(keys)), 0.0)
         found.append(search.descend(keys, start))
         progress("pupils", len(valleys) + 1, len(valleys) + 1)
         found.sort(key=lambda item: item[0])
     whole = Search(config, scale, chosen, free)
-    _, best = min((whole.value(optics) for _, optics in found[:3]), key=lambda item: item[0])
+    _, best = min((whole.value(settings) for _, settings in found[:3]), key=lambda item: item[0])
     value, best = whole.simplified(best)
     if not value < NO_BOUND:
         raise ConfigError(
             "`optimize` = pupil: the parameters are unidentifiable or the camera saturates with "
             "every pupil; lower bounds.photons_per_pixel, or free fewer parameters with fit.mode"
         )
-    return _result(
-        config, whole.config_of(best), scale, chosen, search.keys,
-        descents=tuple(math.exp(log_holevo - value) for value, _ in found),
-        evaluations=search.evaluations + whole.evaluations,
-    )  # fmt: skip
+    shares, evaluations = (
+        tuple(math.exp(log_holevo - value) for value, _ in found),
+        search.evaluations + whole.evaluations,
+    )
+    return _result(config, whole, best, descents=shares, evaluations=evaluations)
 
 
 def _result(
-    config: Config,
-    best: Config,
-    scale: MassScale | None,
-    chosen: tuple[str, ...],
-    keys: Sequence[str],
-    *,
-    descents: tuple[float, ...],
-    evaluations: int,
+    config: Config, whole: Search, found: Settings, *, descents: tuple[float, ...], evaluations: int
 ) -> PupilOptimum:
     """Bounds of the configured and of the best experiment, the latter as it will be written."""
-    best = _uncalibrated(best, scale)
-    here, there = plan(_uncalibrated(config, scale)), plan(best)
-    bound = _holevo(there, chosen)
-    at = [PARAMETERS.index(name) for name in chosen]
-    sigma, own = sigmas(there)
-    silent_camera = with_keys(best, {"camera": {"read_noise_e": 0.0}, "bounds": {"n_before": 0}})
-    quiet, _ = sigmas(plan(silent_camera))
-    before, _ = sigmas(here)
-    joint = FREE_PARAMETERS[config.fit.mode]
-    holevo_sigma = dict(zip(joint, bound.sigma, strict=True))
-
-    def named(values: FloatArray) -> dict[str, float]:
-        return {PARAMETERS[i]: float(values[i]) for i in at}
-
+    chosen, joint = whole.chosen, FREE_PARAMETERS[config.fit.mode]
+    best = _uncalibrated(whole.config_of(found), whole.scale)
+    quiet = with_keys(best, {"camera": {"read_noise_e": 0.0}, "bounds": {"n_before": 0}})
+    here, there = plan(_uncalibrated(config, whole.scale)), plan(best)
+    bound, (sigma, own) = _holevo(there, chosen), sigmas(there)
+    columns = {"configured": sigmas(here)[0], "best": sigma, "qcrb": own}
+    of_holevo = dict(zip(joint, bound.sigma.tolist(), strict=True))
+    experiments = {"configured": here, "best": there, "quiet": plan(quiet)}
     return PupilOptimum(
         config=best,
         chosen=chosen,
-        settings={key: (setting(config.optics, key), setting(best.optics, key)) for key in keys},
-        sigma=named(sigma),
-        sigma_configured=named(before),
-        sigma_holevo={name: float(holevo_sigma[name]) for name in chosen},
-        sigma_quantum=named(own),
-        sum=float(np.sum((sigma[at] / own[at]) ** 2)),
-        sum_configured=float(np.sum((before[at] / own[at]) ** 2)),
+        settings={key: (float(whole.start[key]), float(found[key])) for key in whole.knobs},
+        sigma={
+            name: {kind: float(each[PARAMETERS.index(name)]) for kind, each in columns.items()}
+            | {"holevo": of_holevo[name]}
+            for name in chosen
+        },
+        sums={kind: total_of(each, chosen) for kind, each in experiments.items()},
         holevo=bound.sum,
-        share_quiet=bound.sum / float(np.sum((quiet[at] / own[at]) ** 2)),
         transmitted=transmitted_over_collected(there.model, float(there.theta[2])),
         peak_e=there.peak_e,
         descents=descents,
@@ -394,10 +364,7 @@ def _result(
 def _holevo(experiment: Experiment, chosen: tuple[str, ...]) -> Holevo:
     """Holevo bound over the mode's free parameters, of which the chosen ones weigh."""
     free = FREE_PARAMETERS[experiment.config.fit.mode]
-    index = [PARAMETERS.index(name) for name in free]
-    theta, scale = experiment.theta, experiment.model.scale
-    step = np.array([1.0, 1.0, 1.0, abs(theta[3]) * abs(scale.slope(theta[3]))])
-    light = (experiment.collected * experiment.quantum / np.outer(step, step))[np.ix_(index, index)]
+    light = experiment.light(free)
     weight = np.diag(light).real * [name in chosen for name in free]
     return holevo_bound(light, np.diag(weight))
 

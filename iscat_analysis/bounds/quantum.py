@@ -35,6 +35,7 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 Measure = Literal["exact", "dong2021"]
 Light = Literal["collected", "transmitted"]
+LIGHTS: tuple[Light, Light] = ("transmitted", "collected")
 
 NAMES = ("x_nm", "y_nm", "z_nm", "mass_rel")
 """Parameters of the quantum matrix: position and relative mass."""
@@ -78,12 +79,9 @@ def quantum_information(
         _growth(model, amplitude, light, wave)
         + 1j * kappa[:, None] * wave * (centre - z_nm) / 3,  # a seated sphere rises as it grows
     )
-    out = np.zeros((4, 4), dtype=np.complex128)
-    for i in range(4):
-        for j in range(i, 4):
-            out[i, j] = 4 * np.sum(slopes[i].conj() * slopes[j] * weight)
-            out[j, i] = out[i, j].conj()
-    out[np.diag_indices(4)] = out.diagonal().real
+    rows = (np.array(slopes) * np.sqrt(weight)).reshape(4, -1)
+    half = 2 * rows.conj() @ rows.T
+    out = np.asarray(half + half.conj().T)
     if not isinstance(opening.scatterer, Rod):
         # the light is symmetric under reflection through the centre: exact zeros, not rounding
         out[:2, 2:] = out[2:, :2] = 0.0
@@ -92,10 +90,8 @@ def quantum_information(
 
 def transmitted_over_collected(model: ForwardModel, z_nm: float) -> float:
     """Share of the collected light that mask and analyser let through."""
-    return float(
-        _photons(model, z_nm, "exact", "transmitted")[1].sum()
-        / _photons(model, z_nm, "exact", "collected")[1].sum()
-    )
+    passed, every = (_photons(model, z_nm, light)[1] for light in LIGHTS)
+    return float(passed.sum() / every.sum())
 
 
 def z_nm_phase_free(model: ForwardModel, z_nm: float) -> float:
@@ -104,7 +100,7 @@ def z_nm_phase_free(model: ForwardModel, z_nm: float) -> float:
     Dark field has no reference, so that the global phase is a nuisance: K_zz becomes
     4 (⟨|κ|²⟩ − ⟨Re κ⟩²), the variance of the axial wavenumber where nothing is evanescent.
     """
-    opening, photons = _photons(model, z_nm, "exact", "collected")
+    opening, photons = _photons(model, z_nm, "collected")
     density, kappa = photons.sum(1) / photons.sum(), opening.pupil.axial
     # centred before squaring: the mean is large beside the spread
     centre = np.sum(kappa.real * density)
@@ -143,11 +139,9 @@ def _azimuths() -> FloatArray:
     return np.arange(AZIMUTHS, dtype=np.float64) * (2 * math.pi / AZIMUTHS)
 
 
-def _photons(
-    model: ForwardModel, z_nm: float, measure: Measure, light: Light
-) -> tuple[Aperture, FloatArray]:
+def _photons(model: ForwardModel, z_nm: float, light: Light) -> tuple[Aperture, FloatArray]:
     """Pupil and the photons in each of its directions, shape (angles, AZIMUTHS)."""
-    opening, wave, solid = _light(model, z_nm, measure, light, None)
+    opening, wave, solid = _light(model, z_nm, "exact", light, None)
     density: FloatArray = (np.abs(wave) ** 2).sum(0) * solid[:, None]
     return opening, density
 

@@ -16,22 +16,25 @@ heights of later fits follows from `iscat_analysis.bounds.shared`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from iscat_analysis.bounds.classical import event_bounds
-from iscat_analysis.bounds.experiment import detector, expected_likelihood
+from iscat_analysis.bounds.experiment import detector, expected_likelihood, picked
 from iscat_analysis.config import Config, refuse_rod
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.setup import FAINT_PICTURES, PICTURES_LEFT_OUT
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.maximiser import eliminated, imitation
 from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, ForwardModel, forward_model
 from iscat_analysis.optics.parameters import (
     FAINTEST,
@@ -68,28 +71,6 @@ def joint_information(
     signal, slopes = model.signal(grid, theta[:4], names)
     ordered = np.array([*others, *slopes[4:], *slopes[:4]])
     return likelihood.score_of_signal(signal, ordered, float(theta[4]))[2]
-
-
-def eliminated(information: FloatArray, shared: int) -> FloatArray:
-    """Information about the first parameters after all others are fitted: the Schur complement.
-
-    Shapes: `information` (n, n), result (shared, shared).
-    """
-    cross = information[:shared, shared:]
-    return np.asarray(information[:shared, :shared] + cross @ imitation(information, shared))
-
-
-def imitation(information: FloatArray, shared: int) -> FloatArray:
-    """Change of the last parameters per unit error of the first ones.
-
-    Shapes: `information` (n, n), result (n − shared, shared).
-    """
-    block = information[shared:, shared:]
-    scale = 1 / np.sqrt(np.diag(block))
-    solved = np.linalg.solve(
-        block * np.outer(scale, scale), information[shared:, :shared] * scale[:, None]
-    )
-    return np.asarray(-solved * scale[:, None])
 
 
 def displacement(
@@ -196,26 +177,16 @@ class OpticsForecast:
     def parameters(self) -> pd.DataFrame:
         """One row per free parameter, with its error after the pictures and before them."""
         sigma = np.sqrt(np.diag(self.covariance))
-        columns = {
-            "parameter": list(self.values), "value": list(self.values.values()), "sigma": sigma,
-            "usual_error": self.usual, "determined": are_told(sigma, self.usual),
-        }  # fmt: skip
-        return pd.DataFrame(columns)
+        rows = pd.DataFrame(self.values.items(), columns=["parameter", "value"])
+        told = are_told(sigma, self.usual)
+        return rows.assign(sigma=sigma, usual_error=self.usual, determined=told)
 
     @cached_property
     def common(self) -> dict[str, dict[str, float]]:
         """Standard deviation that the microscope's errors put into all fits alike, by mode."""
-        return {
-            mode: dict(
-                zip(
-                    FREE_PARAMETERS[mode],
-                    # symmetry makes the others 0 [nm, kDa]
-                    (float(s) if s > 1e-9 else 0.0 for s in shared_sigma(moves, self.covariance)),
-                    strict=True,
-                )
-            )
-            for mode, moves in self.moves.items()
-        }
+        sigma = {mode: shared_sigma(moves, self.covariance) for mode, moves in self.moves.items()}
+        # symmetry makes those below 1e-9 nm or kDa 0
+        return _by_name({mode: np.where(each > 1e-9, each, 0.0) for mode, each in sigma.items()})
 
     @property
     def unidentifiable(self) -> tuple[str, ...]:
@@ -237,20 +208,16 @@ class OpticsForecast:
 
     def to_dict(self) -> dict[str, Any]:
         """Give what ``iscat bounds --for optics --json`` prints."""
-        optics, at = self.config.optics, self.config.bounds
         mass = float(self.needed["mass_kda"][FACTORS.index(1.0)])
         return {
             "events": self.events,
             "at": {
                 "mass_kda": mass,
                 "height_nm": self.config.particle.nominal_height_nm,
-                "focus_nm": optics.focus_nm,
-                "na": optics.na,
-                "photons_per_pixel": at.photons_per_pixel,
-                "n_before": at.n_before,
-                "n_after": at.n_after,
-                "roi_nm": self.config.fit.roi_nm,
-                "pixel_size_nm": self.config.camera.pixel_size_nm,
+                **picked(self.config.optics, "focus_nm", "na"),
+                **picked(self.config.bounds, "photons_per_pixel", "n_before", "n_after"),
+                **picked(self.config.fit, "roi_nm"),
+                **picked(self.config.camera, "pixel_size_nm"),
             },
             "snr": self.snr,
             "parameters": self.parameters.to_dict("records"),
@@ -258,14 +225,19 @@ class OpticsForecast:
             "covariance": self.covariance,
             "unidentifiable": list(self.unidentifiable),
             "common": self.common,
-            "single": {
-                mode: dict(zip(FREE_PARAMETERS[mode], sigma, strict=True))
-                for mode, sigma in self.sigma.items()
-            },
+            "single": _by_name(self.sigma),
             "goals": dict(GOALS),
             "warnings": [finding.text for finding in self.findings],
             "needed": self.needed.to_dict("records"),
         }
+
+
+def _by_name(values: Mapping[str, FloatArray]) -> dict[str, dict[str, float]]:
+    """Name the free parameters of each mode."""
+    return {
+        mode: dict(zip(FREE_PARAMETERS[mode], each.tolist(), strict=True))
+        for mode, each in values.items()
+    }
 
 
 @one_thread_algebra()
@@ -276,7 +248,10 @@ def forecast_optics(
     refuse_rod(config, "optics are learned from round particles")
     names = _names(config, free)
     number_in("`events`", events, least=1, whole=True)
-    model, grid = _model(config)
+    pixel, _ = detector(config)
+    grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
+    reach, height = grid.diagonal_nm / 2 + pixel, config.particle.nominal_height_nm
+    model = forward_model(config, reach, z_max_nm=height)
     pictures = {f: _Picture.expected(config, model, grid, f, names) for f in FACTORS}
     here = pictures[1.0]
     usual = prior_of(config).errors(names)
@@ -311,19 +286,13 @@ def _names(config: Config, free: str | Sequence[str] | None) -> tuple[str, ...]:
     return names
 
 
-def _model(config: Config) -> tuple[ForwardModel, PixelGrid]:
-    pixel, _ = detector(config)
-    grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
-    reach = grid.diagonal_nm / 2 + pixel
-    return forward_model(config, reach, z_max_nm=config.particle.nominal_height_nm), grid
-
-
 @dataclass(frozen=True)
 class _Picture:
     """One expected particle, averaged over its place in a pixel."""
 
-    likelihoods: tuple[Likelihood, ...]
-    thetas: tuple[FloatArray, ...]
+    places: tuple[tuple[Likelihood, FloatArray], ...]
+    """The likelihood and θ of each."""
+
     names: tuple[str, ...]
     mass_kda: float
     level: bool
@@ -338,44 +307,37 @@ class _Picture:
         factor: float,
         names: tuple[str, ...],
     ) -> _Picture:
-        at, mass = config.bounds, factor * model.material.mass_kda
-        steps = grid.pixel_nm * ((np.arange(_PHASES) + 0.5) / _PHASES - 0.5)
-        thetas = tuple(
-            np.array([x, y, config.particle.nominal_height_nm, model.scale.amplitude(mass), 0.0])
-            for y in steps
-            for x in steps
+        at, mass, count = config.bounds, factor * model.material.mass_kda, len(names)
+        light, frames, read = (
+            (at.photons_per_pixel,) * 2,
+            (at.n_before, at.n_after),
+            detector(config)[1],
         )
-        likelihoods = tuple(
-            expected_likelihood(
-                model, grid, theta, at.photons_per_pixel, at.photons_per_pixel,
-                n_before=at.n_before, n_after=at.n_after,
-                read_noise_e=float(config.camera.assumed.read_noise_e),
-            )
-            for theta in thetas
-        )  # fmt: skip
-        count = len(names)
-        parts = []
-        for likelihood, theta in zip(likelihoods, thetas, strict=True):
-            whole = joint_information(likelihood, theta, names)
-            # of x, y, z, mass, level the height is given
-            fitted = [i for i in range(count + 5) if i != count + 2]
-            parts.append(eliminated(whole[np.ix_(fitted, fitted)], count))
+        steps = grid.pixel_nm * ((np.arange(_PHASES) + 0.5) / _PHASES - 0.5)
+        rest = config.particle.nominal_height_nm, model.scale.amplitude(mass), 0.0
+        # of x, y, z, mass, level the height is given
+        fitted = np.ix_(*[np.delete(np.arange(count + 5), count + 2)] * 2)
+        places, parts = [], []
+        for y, x in product(steps, steps):
+            theta = np.array([x, y, *rest])
+            one = expected_likelihood(model, grid, theta, light, frames, read_noise_e=read)
+            places.append((one, theta))
+            parts.append(eliminated(joint_information(one, theta, names)[fitted], count))
         level = config.background.method == "sliding"
-        return cls(likelihoods, thetas, names, mass, level, np.asarray(np.mean(parts, axis=0)))
+        return cls(tuple(places), names, mass, level, np.asarray(np.mean(parts, axis=0)))
 
     @property
     def snr(self) -> float:
         """Of the brightest place in a pixel's middle."""
-        middle = len(self.thetas) // 2
-        likelihood, theta = self.likelihoods[middle], self.thetas[middle]
+        likelihood, theta = self.places[len(self.places) // 2]
         signal = likelihood.signal(theta)
         return math.sqrt(float(np.sum(signal**2 * likelihood.signal_information(signal))))
 
     def moves(self, mode: str) -> FloatArray:
         """D of a mode, averaged over the places."""
         found = [
-            displacement(likelihood, theta, self.names, FREE_PARAMETERS[mode], level=self.level)
-            for likelihood, theta in zip(self.likelihoods, self.thetas, strict=True)
+            displacement(*place, self.names, FREE_PARAMETERS[mode], level=self.level)
+            for place in self.places
         ]
         return np.asarray(np.mean(found, axis=0))
 
@@ -383,8 +345,7 @@ class _Picture:
         """Bounds of a mode, averaged over the places."""
         free = FREE_PARAMETERS[mode]
         found = [
-            event_bounds(likelihood, theta, free, 1.0, level=self.level).crb_joint
-            for likelihood, theta in zip(self.likelihoods, self.thetas, strict=True)
+            event_bounds(*place, free, 1.0, level=self.level).crb_joint for place in self.places
         ]
         joint = np.sqrt(np.mean(np.square(found), axis=0))
         return np.asarray(joint[np.isfinite(joint)])
@@ -410,11 +371,8 @@ def _needed(picture: _Picture, names: Sequence[str], usual: FloatArray) -> dict[
 
     def least(reached: Callable[[float], bool]) -> float:
         """Find the number of events that suffices, by halves."""
-        low, high = 0, _MANY
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (low, middle) if reached(middle) else (middle, high)
-        return float(high) if reached(high) else math.nan
+        found = 1 + bisect_left(range(1, _MANY + 1), True, key=reached)
+        return float(found) if found <= _MANY else math.nan
 
     can = are_told(errors(_MANY)[0], usual)
     goals = dict(GOALS)

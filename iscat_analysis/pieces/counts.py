@@ -233,8 +233,7 @@ class Counts:
             background=MEAN if counted else KNOWN,
             noise=choose_noise("auto", interferes=interferes, counted=counted),
             scale_e=None if interferes else self._scale_e(ratio),
-            read_variance_before_e2=self.n_before * read_e**2,
-            read_variance_after_e2=self.n_after * read_e**2,
+            read_variances_e2=(self.n_before * read_e**2, self.n_after * read_e**2),
             masked=self.masked[index],
         )
 

@@ -193,11 +193,9 @@ def crb(
     read_noise_e = float(camera.assumed.read_noise_e)
 
     def bound(at: _At) -> FloatArray:
-        setup = at.model, setups.grid, at.theta, at.level_e, at.scale_e
-        n_before, n_after = int(at.n_before), int(at.n_after)
-        likelihood = expected_likelihood(
-            *setup, n_before=n_before, n_after=n_after, read_noise_e=read_noise_e
-        )
+        frames = int(at.n_before), int(at.n_after)
+        setup = at.model, setups.grid, at.theta, (at.level_e, at.scale_e), frames
+        likelihood = expected_likelihood(*setup, read_noise_e=read_noise_e)
         rod = at.model.aperture.scatterer
         if isinstance(rod, Rod):
             every = np.insert(at.theta, LEVEL, [rod.azimuth_deg, rod.tilt_deg])

@@ -84,7 +84,8 @@ def design_toml(design: PupilOptimum) -> str:
     return (
         "# The pupil with the smallest joint bound of "
         f"{', '.join(design.chosen)}: iscat bounds --optimize pupil.\n"
-        f"# It takes {100 * design.share:.1f} % of what one measurement can take of the light.\n"
+        f"# It takes {100 * design.shares['best']:.1f} % of what one measurement can take of the "
+        "light.\n"
         "# As --config it gives the same bounds; as optics.file it gives the optics alone, and\n"
         "# bounds.photons_per_pixel must follow the attenuation squared.\n\n"
         + config_to_toml(config, comments=False, sections=sections)
@@ -97,16 +98,13 @@ def pupil_figure(design: PupilOptimum) -> Figure:
     left, right = figure.subplots(1, 2, width_ratios=[1.3, 1])
     at = np.arange(len(design.chosen))
 
-    def chosen(values: Mapping[str, float]) -> FloatArray:
-        return np.array([values[name] for name in design.chosen])
-
-    own = chosen(design.sigma_quantum)
-    for values, marker, color, label in (
-        (design.sigma_configured, "D", INK, "configured"),
-        (design.sigma, "D", VERMILLION, "best pupil"),
-        (design.sigma_holevo, "o", BLUE, "all at once, at best (Holevo)"),
+    for kind, marker, color, label in (
+        ("configured", "D", INK, "configured"),
+        ("best", "D", VERMILLION, "best pupil"),
+        ("holevo", "o", BLUE, "all at once, at best (Holevo)"),
     ):
-        left.plot(at, chosen(values) / own, marker, color=color, label=label)
+        values = [each[kind] / each["qcrb"] for each in design.sigma.values()]
+        left.plot(at, values, marker, color=color, label=label)
     left.axhline(1.0, color=BLUE, lw=1.2, ls="--", label="quantum bound of each alone")
     left.set_xticks(at, [LABELS[name] for name in design.chosen])
     left.set(xlim=(-0.5, at.size - 0.5), ylabel="σ over its own quantum bound")

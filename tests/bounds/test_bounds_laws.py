@@ -376,13 +376,3 @@ def test_finite_background_costs_root_two_and_then_nothing() -> None:
     )  # fmt: skip
     assert equal / known == pytest.approx(math.sqrt(2), rel=1e-4)
     assert long / known == pytest.approx(1, rel=1e-6)
-
-
-def test_read_noise_adds_to_the_variance() -> None:
-    quiet, noisy = (
-        bounds_report(small_config(camera={"read_noise_e": r}, particle={"diameter_nm": 2.0}))[
-            "actual"
-        ]["crb_single"]["x_nm"]
-        for r in (0.0, 100.0)
-    )
-    assert noisy / quiet == pytest.approx(math.sqrt(2), rel=1e-4)  # σ_r² = 1e4 e² = background

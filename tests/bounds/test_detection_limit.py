@@ -7,20 +7,13 @@ import math
 import numpy as np
 from scipy.stats import norm
 
-from iscat_analysis.bounds import (
-    DetectionLimit,
-    Experiment,
-    detection_limit,
-    plan,
-    power_known,
-    power_searched,
-)
+from iscat_analysis.bounds import DetectionLimit, Experiment, detection_limit, plan, power_searched
 from iscat_analysis.config import parse_config
 from iscat_analysis.inference import counts as noise
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import forward_model
-from iscat_analysis.records import Candidate, FloatArray
+from iscat_analysis.records import Box, Candidate, FloatArray
 
 DRAWS = 400
 SIGMAS = 4.0
@@ -58,10 +51,8 @@ def _known(experiment: Experiment, mass: float) -> FloatArray:
     for seed in range(DRAWS):
         start = experiment.theta.copy()
         start[3] = 0.0
-        wide = np.where(free, 1e6, start)
-        best = _drawn(experiment, mass, seed).maximize(
-            start, free, np.where(free, -1e6, start), wide
-        )
+        box = Box(free, *(np.where(free, end, start) for end in (-1e6, 1e6)))
+        best = _drawn(experiment, mass, seed).maximize(start, box)
         found.append(math.copysign(math.sqrt(2 * max(best.log_likelihood, 0)), best.theta[3]))
     return np.array(found)
 
@@ -81,7 +72,7 @@ def test_a_known_place_keeps_its_false_alarms_and_misses() -> None:
     # and the curve has this slope: a third less mass is another curve
     fainter = limit.snr_known * 2 / 3
     found = np.mean(_known(experiment, limit.mass_known_kda * 2 / 3) > limit.threshold_known)
-    assert _off(float(found), power_known(fainter, limit.threshold_known)) < SIGMAS
+    assert _off(float(found), norm.cdf(fainter - limit.threshold_known)) < SIGMAS
     assert _off(float(found), 0.9) > SIGMAS
 
 

@@ -133,9 +133,7 @@ def assert_ordered(count: int, seed: int) -> None:
         classical = experiment.bounds(PARAMETERS)
         if classical.unidentifiable:
             continue
-        light = experiment.collected * experiment.quantum
-        slope = experiment.theta[3] * experiment.model.scale.slope(experiment.theta[3])
-        light /= np.outer([1, 1, 1, slope], [1, 1, 1, slope])
+        light = experiment.light(PARAMETERS)
         together = natural_bound(light)
         reached = np.trace(light.real @ np.linalg.inv(classical.fisher))
         assert reached >= together.sum >= 4 - 1e-12

@@ -12,6 +12,7 @@ import iscat_analysis as ia
 from iscat_analysis.bounds.shared import forecast_optics
 from iscat_analysis.instrument.joint_fit import maximise
 from iscat_analysis.optics.parameters import FREE, is_term, settings_of
+from iscat_analysis.records import Box
 
 REALISTIC: dict[str, Any] = {
     "optics.na": 1.40, "optics.focus_nm": -370.0, "optics.reference_phase_deg": 20.0,
@@ -125,7 +126,7 @@ def test_masses_of_other_particles_err_by_what_was_foreseen() -> None:
         start[3] = wrong.scale.amplitude(200.0)
         width = np.array([80.0, 80.0, 0.0, abs(start[3]), 0.5])
         free = np.array([True, True, False, True, True])
-        best = likelihood.maximize(start, free, start - width, start + width, tolerance=1e-9)
+        best = likelihood.maximize(start, Box(free, start - width, start + width), tolerance=1e-9)
         masses.append(float(wrong.scale.mass(np.array(best.theta[3]))))
     spread = float(np.std(masses, ddof=1))
     # the spread of 40 draws is known to 11 %
