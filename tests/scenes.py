@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels import hessian
 from iscat_analysis.camera import start_power
 from iscat_analysis.config import Config, config_to_toml, parse_config
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.records import Windows
 from iscat_analysis.study import Movie, write_stack
 
@@ -147,3 +149,11 @@ def write_bright_landings(movie: Path, setup: Path) -> None:
     true = {**nominal, "optics": nominal["optics"] | OPTICS_TRUTH, "simulation": simulation}
     write_stack(parse_config(true), movie)
     setup.write_text(config_to_toml(parse_config(nominal)), encoding="utf-8")
+
+
+def observed_information(likelihood: Likelihood, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Negative Hessian of a log-likelihood at θ, shape (5, 5)."""
+    level, rows = float(np.exp(theta[LEVEL])), likelihood.derivatives(theta)
+    out = hessian.observed_information(likelihood.measured, level, rows)
+    out[2, 2] += likelihood.height_prior[1]
+    return out

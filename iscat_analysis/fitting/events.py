@@ -136,8 +136,9 @@ def region_likelihood(
         ),
         scale_e=photons_scale(context, windows) if context.additive else None,
         others=others,
-        read_variance_before_e2=windows.read_variance_before_e2[cut],
-        read_variance_after_e2=windows.read_variance_after_e2[cut],
+        read_variances_e2=(
+            windows.read_variance_before_e2[cut], windows.read_variance_after_e2[cut]
+        ),
         masked=masked,
     )  # fmt: skip
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,40 +27,42 @@ LEAST_EXPLAINED_SHARE = 0.3
 """Share of χ² in excess that a parameter must explain to be named."""
 
 
-PIXEL = "camera.pixel_size_nm"
+class _Part(NamedTuple):
+    """A number of the microscope: keys of ``[optics]`` or Zernike terms, with small steps of them.
+
+    Beside the critical angle, and where rings have moved by half of their distance, a first order
+    says little: steps that are `far` are tried whole.  In dark field, where light on either side of
+    the best focus looks much alike, `far_dark` replaces them.
+    """
+
+    steps: Mapping[str, float]
+    unit: str | None = None
+    far: Sequence[float] = ()
+    far_dark: Sequence[float] = ()
+
+
+def _both_ways(step: float, count: int) -> tuple[float, ...]:
+    return tuple(step * k for k in range(-count, count + 1) if k)
+
+
+PIXEL, _WAVELENGTH = "camera.pixel_size_nm", "wavelength"
 _PHASE = "reference phase"
-_STEPS: Mapping[str, Mapping[str, float]] = {
-    "focus": {"focus_nm": 20.0},
-    "numerical aperture": {"na": 0.005},
-    "wavelength": {"wavelength_nm": 2.0},
-    _PHASE: {"reference_phase_deg": 5.0},
-    "spherical aberration": {"z11": 5.0},
-    "astigmatism": {"z5": 5.0, "z6": 5.0},
-    "coma": {"z7": 5.0, "z8": 5.0},
-}  # small enough for a first order, and for what a table of the field resolves
-_FAR: Mapping[str, Sequence[float]] = {
-    "focus": (*range(-300, 0, 50), *range(50, 301, 50)),
-    "numerical aperture": (-0.15, -0.12, -0.09, -0.06, -0.03, 0.03, 0.06, 0.09, 0.12, 0.15),
-    "wavelength": (-80.0, -60.0, -40.0, -20.0, 20.0, 40.0, 60.0, 80.0),
-    PIXEL: (-20.0, -15.0, -10.0, -5.0, 5.0, 10.0, 15.0, 20.0),
+_PARTS = {
+    "focus": _Part({"focus_nm": 20.0}, "nm", _both_ways(50.0, 6), _both_ways(50.0, 20)),
+    "numerical aperture": _Part({"na": 0.005}, "", _both_ways(0.03, 5)),
+    _WAVELENGTH: _Part({"wavelength_nm": 2.0}, "nm", _both_ways(20.0, 4)),
+    _PHASE: _Part({"reference_phase_deg": 5.0}, "degrees"),
+    "spherical aberration": _Part({"z11": 5.0}, "nm rms", far_dark=_both_ways(15.0, 4)),
+    "astigmatism": _Part({"z5": 5.0, "z6": 5.0}),
+    "coma": _Part({"z7": 5.0, "z8": 5.0}),
+    PIXEL: _Part({}, "%", _both_ways(5.0, 4)),
 }
-"""Steps that are tried whole.
+"""Steps are small enough for a first order, and for what a table of the field resolves."""
 
-Beside the critical angle, and where rings have moved by half of their distance, a first order says
-little.
-"""
-
-_FAR_DARK: Mapping[str, Sequence[float]] = {
-    "focus": (*range(-1000, 0, 50), *range(50, 1001, 50)),
-    "spherical aberration": (-60.0, -45.0, -30.0, -15.0, 15.0, 30.0, 45.0, 60.0),
-}
-"""The same in dark field, where light on either side of the best focus looks much alike."""
-
-_SCALES = (PIXEL, "wavelength")
-"""What stretches pictures: a movie may not tell one from the other."""
-
-
+_TURNED = "polarisation, as if turned by 90° (or the movie transposed)"
+_MASK = "mask in the pupil"
 _OTHERS: Mapping[str, Mapping[str, Any]] = {
+    _TURNED: {},
     "polarisation, as if circular light passed an analyser": {
         "polarization": "circular",
         "analyzer": True,
@@ -69,17 +71,12 @@ _OTHERS: Mapping[str, Mapping[str, Any]] = {
         "polarization": "linear",
         "analyzer": False,
     },
-    "mask in the pupil": {"mask_na": 0.6, "attenuation": 0.3},
+    _MASK: {"mask_na": 0.6, "attenuation": 0.3},
     'emission, as if it were "dong2021"': {"emission": "dong2021"},
     'emission, as if it were "reciprocal"': {"emission": "reciprocal"},
 }
-_TURNED = "polarisation, as if turned by 90° (or the movie transposed)"
-_UNITS = {
-    "focus": "nm", _PHASE: "degrees", "spherical aberration": "nm rms",
-    "wavelength": "nm", PIXEL: "%", "numerical aperture": "",
-}  # fmt: skip
-_NAMES = (*_STEPS, PIXEL, _TURNED, *_OTHERS)
-_WHOLE = (_TURNED, *(name for name in _OTHERS if "mask" not in name))  # there or not
+"""Other settings, which are there or not; of a mask any share."""
+
 _WHOLE_STEP = 0.5  # of one that is tried whole, which the residuals ask for at least
 _MOST_SCALE_CHANGE = 30.0  # per cent, farther than which no pixel size is tried
 
@@ -104,17 +101,15 @@ class Cause:
         """What the residuals resemble, in words."""
         by = ""
         if self.step is not None:
-            steps = [_rounded(step) for step in (self.step, *self.other_steps)]
-            *first, last = steps
+            *first, last = (_rounded(step) for step in (self.step, *self.other_steps))
             several = f"{', '.join(first)} or {last}" if first else last
             by = f", off by about {several} {self.unit}".rstrip()
         by += "".join(
             f", or {name}, by {_rounded(step)} {unit}" for name, step, unit in self.rivals
         )
-        alike = (
-            ", which these pictures do not tell apart" if self.other_steps or self.rivals else ""
-        )
-        return f"a wrong {self.name}{by}{alike} ({self.share:.0%} of it)"
+        if self.other_steps or self.rivals:
+            by += ", which these pictures do not tell apart"
+        return f"a wrong {self.name}{by} ({self.share:.0%} of it)"
 
     @property
     def message(self) -> str:
@@ -141,7 +136,7 @@ def likely_cause(
     excess = sum(each.excess for each in left)
     if excess <= 0:
         return None
-    found = {name: _explained_by(config, name, left, excess) for name in _NAMES}
+    found = {name: _explained_by(config, name, left, excess) for name in (*_PARTS, *_OTHERS)}
     named = {name: tried for name, tried in found.items() if tried[0][0] > LEAST_EXPLAINED_SHARE}
     if not named:  # a share is above 1 where there is less noise than the camera's numbers say
         return None
@@ -152,17 +147,23 @@ def likely_cause(
     margin = max(1 - share, 0.03) + 4.0 * math.sqrt(2 * pixels) / excess
 
     others = [other for s, other in named[name][1:] if s > share - margin]
-    scales = [n for n in _SCALES if n in named and name in _SCALES and n != name]
-    rivals = [n for n in scales if named[n][0][0] > share - margin]
+    # what stretches pictures: a movie may not tell one from the other
+    rival = {PIXEL: _WAVELENGTH, _WAVELENGTH: PIXEL}.get(name, "")
+    rivals = [
+        (rival, other, _PARTS[rival].unit or "")
+        for share_of_other, other in named.get(rival, ())
+        if share_of_other > share - margin
+    ]
+    unit = _PARTS[name].unit if name in _PARTS else None
     return Cause(
         name=name,
         share=min(share, 1.0),
-        step=step if name in _UNITS else None,
-        unit=_UNITS.get(name, ""),
+        step=None if unit is None else step,
+        unit=unit or "",
         events=len(fits),
         learned=config.optics.interferes,
         other_steps=tuple(others),
-        rivals=tuple((n, named[n][0][1], _UNITS[n]) for n in rivals),
+        rivals=tuple(rivals),
     )
 
 
@@ -174,37 +175,34 @@ def _explained_by(
     The best one comes first.  The others are local maxima, such as pictures on the other side of
     focus.
     """
-    reach = left[0].reach_nm
+    part, reach = _PARTS.get(name), left[0].reach_nm
     changes = _neighbours(config, name, reach)
     if not changes:
         return [(0.0, 0.0)]
-    share, steps = _explained(left, changes, excess, whole=name in _WHOLE)
-    graded = len(changes) == 1 and name not in (_TURNED, *_OTHERS)
+    share, steps = _explained(left, changes, excess, whole=part is None and name != _MASK)
+    step = float(steps[0])
+    if part is None or len(changes) > 1:
+        return [(share, step)]
     # far from a first order: the same, as far away as it seems, if a microscope is there
     turns = name == _PHASE and left[0].free_mass
     if turns:
-        steps = _angle(steps)
-    if (
-        graded
-        and share > LEAST_EXPLAINED_SHARE
-        and (there := _neighbours(config, name, reach, float(steps[0])))
-    ):
-        share, asked = _explained(left, there, excess)
-        steps = steps if turns else asked
-    best = (share, float(steps[0]))
+        # A picture turned by Δ is cos Δ of the picture plus sin Δ of its derivative.  The fitted
+        # mass takes up the cosine, so that the residual per mass is tan Δ.
+        step = math.degrees(math.atan(math.radians(step)))
+    if share > LEAST_EXPLAINED_SHARE and (there := _neighbours(config, name, reach, step)):
+        share, steps = _explained(left, there, excess)
+        step = step if turns else float(steps[0])
+    far_dark = () if config.optics.interferes else part.far_dark
     whole: list[tuple[float, float]] = []
-    dark = not config.optics.interferes
-    for far in _FAR.get(name, ()) if not dark else _FAR_DARK.get(name, _FAR.get(name, ())):
+    for far in far_dark or part.far:
         if not (there := _neighbours(config, name, reach, far)):
             continue
-        share, asked = _explained(left, there, excess)
+        share_there, steps = _explained(left, there, excess)
         # what is as bright elsewhere may be much brighter here: of |E|² only the shape is alike
-        alike = _WHOLE_STEP < asked[0] / far < 1 / _WHOLE_STEP
-        if alike or (dark and name in _FAR_DARK and asked[0] / far > 0):
-            whole.append((share, far))
-    if not dark or name not in _FAR_DARK:
-        return [max([best, *whole])]
-    return _peaks(best, whole)
+        alike = _WHOLE_STEP < steps[0] / far < 1 / _WHOLE_STEP
+        if alike or (far_dark and steps[0] / far > 0):
+            whole.append((share_there, far))
+    return _peaks((share, step), whole) if far_dark else [max([(share, step), *whole])]
 
 
 def _peaks(
@@ -275,15 +273,6 @@ def _rounded(step: float) -> str:
     return f"{float(f'{step:.2g}'):+g}"
 
 
-def _angle(step: FloatArray) -> FloatArray:
-    """Convert a phase error from its first-order value to an angle [degrees].
-
-    A picture turned by Δ is cos Δ of the picture plus sin Δ of its derivative.  The fitted mass
-    takes up the cosine, so that the residual per mass is tan Δ.
-    """
-    return np.degrees(np.arctan(np.radians(step)))
-
-
 def _explained(
     left: Sequence[_Left],
     changes: Sequence[tuple[float, _Picture]],
@@ -311,10 +300,10 @@ def _neighbours(
 ) -> list[tuple[float, _Picture]]:
     """Give configurations that differ in one parameter of the microscope.
 
-    They differ by `far` where it is given, else by `_STEPS`.  There are none where no optics have
-    such a value, or where particles would change their sign against the calibration line.
+    They differ by `far` where it is given, else by small steps.  There are none where no optics
+    have such a value, or where particles would change their sign against the calibration line.
     """
-    optics = config.optics
+    optics, terms = config.optics, config.optics.aberrations_nm
     if name == PIXEL:
         percent = 1.0 if far is None else max(min(far, _MOST_SCALE_CHANGE), -_MOST_SCALE_CHANGE)
         larger = 1 + percent / 100
@@ -326,26 +315,25 @@ def _neighbours(
 
         return [(percent, stretched)]
     updates: list[tuple[float, dict[str, Any]]]
-    if name in _STEPS:
-        steps = {key: step if far is None else far for key, step in _STEPS[name].items()}
-        least_index = min(optics.n_immersion, optics.n_glass)
-        if not 0 < optics.na + steps.get("na", 0.0) < least_index:
-            return []
-        if optics.wavelength_nm + steps.get("wavelength_nm", 0.0) <= 0:
+    if name in _PARTS:
+        steps = {key: step if far is None else far for key, step in _PARTS[name].steps.items()}
+        na = optics.na + steps.get("na", 0.0)
+        wavelength_nm = optics.wavelength_nm + steps.get("wavelength_nm", 0.0)
+        if not (0 < na < min(optics.n_immersion, optics.n_glass) and wavelength_nm > 0):
             return []
         updates = [
             (step, {key: getattr(optics, key) + step})
             if hasattr(optics, key)
-            else (step, {"aberrations_nm": _further(optics.aberrations_nm, key, step)})
+            else (step, {"aberrations_nm": {**terms, key: terms.get(key, 0.0) + step}})
             for key, step in steps.items()
         ]
-    elif name == _TURNED:
-        other = {"polarization_deg": (optics.polarization_deg + 90.0) % 180.0}
-        updates = [] if optics.polarization == "circular" else [(1.0, other)]
     else:
         other = dict(_OTHERS[name])
         same = all(getattr(optics, key) == value for key, value in other.items())
-        updates = [] if same or ("mask_na" in other and optics.mask_na > 0) else [(1.0, other)]
+        if name == _TURNED:
+            other = {"polarization_deg": (optics.polarization_deg + 90.0) % 180.0}
+            same = optics.polarization == "circular"
+        updates = [] if same or (name == _MASK and optics.mask_na > 0) else [(1.0, other)]
     others = [
         (step, config.model_copy(update={"optics": optics.model_copy(update=update)}))
         for step, update in updates
@@ -354,7 +342,3 @@ def _neighbours(
         return [(step, forward_model(other, reach_nm).image) for step, other in others]
     except ConfigError:
         return []
-
-
-def _further(aberrations: Mapping[str, float], key: str, step: float) -> dict[str, float]:
-    return {**aberrations, key: aberrations.get(key, 0.0) + step}

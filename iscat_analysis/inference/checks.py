@@ -51,12 +51,9 @@ def real_array(name: str, value: ArrayLike) -> FloatArray:
 def vector_of(name: str, value: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     """Check the shape of parameters."""
     array = real_array(name, value)
-    if array.shape == shape:
-        return array
-    fits = array.ndim == len(shape) and all(
-        wanted in (-1, there) for wanted, there in zip(shape, array.shape, strict=True)
-    )
-    if not fits:
+    if array.ndim != len(shape) or any(
+        wanted not in (-1, there) for wanted, there in zip(shape, array.shape, strict=True)
+    ):
         needed = "(" + ", ".join("n" if n < 0 else str(n) for n in shape) + ")"
         raise DataError(f"{name}: has shape {array.shape} where {needed} is needed")
     return array
@@ -80,8 +77,7 @@ def pixels_of(
         raise DataError(f"{name}: has shape {array.shape}; give {also}an array of shape {shape}")
     finite = np.isfinite(array)
     if not finite.all():
-        wrong = int(np.count_nonzero(~finite & ~masked))
-        if wrong:
+        if wrong := int(np.count_nonzero(~finite & ~masked)):
             raise DataError(
                 f"{name}: is not finite in {count(wrong, 'pixel')}; mask them with masked=…"
             )
@@ -124,10 +120,11 @@ def number_in(
         low = max(low, math.nextafter(above, math.inf), above + 1 / LARGEST)
     if low <= number <= most and not (whole and number != round(number)):
         return number
-    limit = f" of at least {least:g}" if least is not None else ""
-    limit = f" above {above:g}" if above is not None else limit
-    limit = f" of at least {low:g}" if above is not None and above < number < low else limit
-    limit = f" of at most {most:g}" if number > most else limit
+    limit = "" if least is None else f" of at least {least:g}"
+    if number > most:
+        limit = f" of at most {most:g}"
+    elif above is not None:
+        limit = f" of at least {low:g}" if above < number < low else f" above {above:g}"
     what = what or ("whole number" if whole else "number")
     raise ConfigError(f"{name} = {shown(value)}: give one {what}{limit}")
 

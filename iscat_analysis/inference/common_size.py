@@ -116,99 +116,101 @@ class CommonSize:
         return np.asarray(inverse @ (excess * spread + self.prior) @ inverse)
 
 
-def common_sizes(
-    likelihoods: Sequence[Likelihood],
-    model: SizedModel,
-    places: FloatArray,
-    z_range_nm: tuple[float, float],
-) -> list[CommonSize]:
-    """Fit one diameter to all frames of a particle: every maximum that is likely, the best first.
+@dataclass(frozen=True)
+class SphereFrames:
+    """Frames of one sphere, with the model of its images and the heights that it may have."""
 
-    Shapes: `places` (frames, 3), where each frame was fitted alone.
-    """
-    masses = scanned_masses(model, *model.mass_range_kda)
-    heights = scanned_heights(model, *z_range_nm)
-    scans = np.array(
-        [
-            scan_sizes(likelihood, model, np.array([*place, 0.0, 0.0]), masses, heights)
-            for likelihood, place in zip(likelihoods, places, strict=True)
-        ]
-    )
-    found: list[CommonSize] = []
-    for (k,) in highest_maxima(scans.max(axis=2).sum(axis=0), _MAXIMA):
-        starts = [
-            (f, [*places[f, :2], heights[at]])
-            for f, scan in enumerate(scans[:, k])
-            for (at,) in highest_maxima(scan, _HEIGHTS)
-        ]
-        best = max((one.log_likelihood for one in found if one.converged), default=-math.inf)
-        one = fit_common_size(
-            likelihoods, model, np.array([place for _, place in starts]), z_range_nm,
-            frames=np.array([f for f, _ in starts]), mass_kda=float(masses[k]),
-            least=best - FOLLOWED,
-        )  # fmt: skip
-        if one is not None and not any(
-            abs(one.mass_kda / other.mass_kda - 1) < 1e-3 for other in found
-        ):
-            found.append(one)
-    return sorted(found, key=lambda one: -one.log_likelihood)
+    likelihoods: Sequence[Likelihood]
+    model: SizedModel
+    z_range_nm: tuple[float, float]
 
+    def common_sizes(self, places: FloatArray) -> list[CommonSize]:
+        """Fit one diameter to all frames: every maximum that is likely, the best first.
 
-def fit_common_size(
-    likelihoods: Sequence[Likelihood],
-    model: SizedModel,
-    places: FloatArray,
-    z_range_nm: tuple[float, float],
-    *,
-    frames: IntArray | None = None,
-    mass_kda: float,
-    index: float | None = None,
-    motion: tuple[float, float] | None = None,
-    least: float = -math.inf,
-) -> CommonSize | None:
-    """Fit mass and places of all frames, from a start; the index too where one is given.
+        Shapes: `places` (frames, 3), where each frame was fitted alone.
+        """
+        masses = scanned_masses(self.model, *self.model.mass_range_kda)
+        heights = scanned_heights(self.model, *self.z_range_nm)
+        scans = np.array(
+            [
+                scan_sizes(likelihood, self.model, np.array([*place, 0.0, 0.0]), masses, heights)
+                for likelihood, place in zip(self.likelihoods, places, strict=True)
+            ]
+        )
+        found: list[CommonSize] = []
+        for (k,) in highest_maxima(scans.max(axis=2).sum(axis=0), _MAXIMA):
+            starts = [
+                (f, [*places[f, :2], heights[at]])
+                for f, scan in enumerate(scans[:, k])
+                for (at,) in highest_maxima(scan, _HEIGHTS)
+            ]
+            frames, rows = (np.array(each) for each in zip(*starts, strict=True))
+            best = max((one.log_likelihood for one in found if one.converged), default=-math.inf)
+            mass = float(masses[k])
+            one = self.fit(rows, frames=frames, mass_kda=mass, least=best - FOLLOWED)
+            if one is not None and not any(
+                abs(one.mass_kda / other.mass_kda - 1) < 1e-3 for other in found
+            ):
+                found.append(one)
+        return sorted(found, key=lambda one: -one.log_likelihood)
 
-    None where the start has no likelihood, as where light would be negative.
+    def fit(
+        self,
+        places: FloatArray,
+        *,
+        mass_kda: float,
+        index: float | None = None,
+        frames: IntArray | None = None,
+        motion: tuple[float, float] | None = None,
+        least: float = -math.inf,
+    ) -> CommonSize | None:
+        """Fit mass and places of all frames, from a start; the index too where one is given.
 
-    `frames` has the number of the frame of each place; without, every frame has one.  `motion` is
-    1/d of the hydrodynamic diameter and its error [1/nm], a prior that is normal in D.  A level
-    that is given beside the places is fitted as they are.
+        None where the start has no likelihood, as where light would be negative.
 
-    Shapes: `places` (n, 3) or (n, 4), `frames` (n,).
-    """
-    common = np.array([mass_kda] if index is None else [mass_kda, index])
-    rows, owners = places.copy(), np.arange(len(likelihoods)) if frames is None else frames
-    rows[:, 2] = np.clip(rows[:, 2], *z_range_nm)
-    joint = _Joint(likelihoods, model, z_range_nm, motion, common.size)
-    converged = False
-    while True:
-        here = joint.gathered(rows, owners, common)
-        if not math.isfinite(here.value):
-            return None
-        # Share of a fringe by which two heights of a frame differ at least
-        kept = _still_likely(here, rows, owners, (1 / 8) * model.fringe_nm)
-        if kept.all() and converged:
-            break
-        rows, owners = rows[kept], owners[kept]
-        found = joint.maximised(rows, owners, common, least)
-        common, rows = found.theta[: common.size], found.theta[common.size :].reshape(rows.shape)
-        if not found.converged:
-            here, converged = joint.gathered(rows, owners, common), False
-            break
-        converged = True
-    return CommonSize(
-        mass_kda=float(common[0]),
-        index=float(common[1]) if index is not None else model.sphere.index.real,
-        likely=rows,
-        frames=owners,
-        places=rows[_best_of_each(here.values, owners)],
-        log_likelihood=here.value,
-        log_weight=_log_weight(here, owners),
-        information=here.information,
-        prior=here.prior,
-        bias=_bias(joint, rows, owners, common, here),
-        converged=converged,
-    )
+        `frames` has the number of the frame of each place; without, every frame has one.  `motion`
+        is 1/d of the hydrodynamic diameter and its error [1/nm], a prior that is normal in D.  A
+        level that is given beside the places is fitted as they are.
+
+        Shapes: `places` (n, 3) or (n, 4), `frames` (n,).
+        """
+        common = np.array([mass_kda] if index is None else [mass_kda, index])
+        rows = places.copy()
+        owners = np.arange(len(self.likelihoods)) if frames is None else frames
+        rows[:, 2] = np.clip(rows[:, 2], *self.z_range_nm)
+        joint = _Joint(self, motion, common.size)
+        converged = False
+        while True:
+            here = joint.gathered(rows, owners, common)
+            if not math.isfinite(here.value):
+                return None
+            # Share of a fringe by which two heights of a frame differ at least
+            kept = _still_likely(here, rows, owners, (1 / 8) * self.model.fringe_nm)
+            if kept.all() and converged:
+                break
+            rows, owners = rows[kept], owners[kept]
+            found = joint.maximised(rows, owners, common, least)
+            common, rows = (
+                found.theta[: common.size],
+                found.theta[common.size :].reshape(rows.shape),
+            )
+            converged = found.converged
+            if not converged:
+                here = joint.gathered(rows, owners, common)
+                break
+        return CommonSize(
+            mass_kda=float(common[0]),
+            index=float(common[1]) if index is not None else self.model.sphere.index.real,
+            likely=rows,
+            frames=owners,
+            places=rows[_best_of_each(here.values, owners)],
+            log_likelihood=here.value,
+            log_weight=_log_weight(here, owners),
+            information=here.information,
+            prior=here.prior,
+            bias=_bias(joint, rows, owners, common, here),
+            converged=converged,
+        )
 
 
 class _Frames(NamedTuple):
@@ -231,16 +233,14 @@ class _Frames(NamedTuple):
 class _Joint:
     """The likelihood of all frames, of `count` common parameters."""
 
-    likelihoods: Sequence[Likelihood]
-    model: SizedModel
-    z_range_nm: tuple[float, float]
+    of: SphereFrames
     motion: tuple[float, float] | None
     count: int
 
     @property
     def particle(self) -> ParticleModel:
         """Sphere of a known index, or of one that is fitted."""
-        return self.model if self.count == 1 else SphereOfIndex(self.model)
+        return self.of.model if self.count == 1 else SphereOfIndex(self.of.model)
 
     def maximised(
         self, rows: FloatArray, owners: IntArray, common: FloatArray, least: float
@@ -270,7 +270,7 @@ class _Joint:
                 # the next step goes back by more than half of the last, where both go too far
                 back = -np.sum(moves * last, axis=1) > 0.5 * np.sum(last**2, axis=1)
                 last, shorter = moves, np.where(back, shorter / 2, shorter)
-            far = np.abs(moves).max(axis=1) / (0.1 * self.model.optics.wavelength_nm)
+            far = np.abs(moves).max(axis=1) / (0.1 * self.of.model.optics.wavelength_nm)
             moves = moves * (shorter / np.maximum(far, 1.0))[:, None]
             whole = np.concatenate([step, moves.ravel()])
             # a damped step is shorter: half of it at first
@@ -279,11 +279,11 @@ class _Joint:
         def farthest(theta: FloatArray) -> FloatArray:
             out = np.full(theta.size, math.inf)
             # largest relative change of the mass in a step, and of n − n_s
-            out[:k] = 0.2 * np.abs(theta[:k] - [0.0, self.model.optics.n_sample][:k])
+            out[:k] = 0.2 * np.abs(theta[:k] - [0.0, self.of.model.optics.n_sample][:k])
             return out
 
         lower, upper = np.full((2, k + rows.size), math.inf) * [[-1], [1]]
-        lower[k:].reshape(shape)[:, 2], upper[k:].reshape(shape)[:, 2] = self.z_range_nm
+        lower[k:].reshape(shape)[:, 2], upper[k:].reshape(shape)[:, 2] = self.of.z_range_nm
         box = Box(np.ones(lower.size, dtype=bool), lower, upper)
         start = np.concatenate([common, rows.ravel()])
         return maximise(gathered, start, box, farthest, least=least, step_of=step_of)
@@ -295,7 +295,7 @@ class _Joint:
         known, inverse, mixed = np.zeros((n, k, k)), np.zeros((n, p, p)), np.zeros((n, p, k))
         mass = float(common[0])
         for b, (place, f) in enumerate(zip(rows, owners, strict=True)):
-            terms, slopes = self.terms(self.likelihoods[f], place, common)
+            terms, slopes = self.terms(self.of.likelihoods[f], place, common)
             if not math.isfinite(terms.value):
                 continue
             flat = slopes.reshape(p + k, -1)
@@ -303,21 +303,21 @@ class _Joint:
             fisher = (flat * terms.information.ravel()) @ flat.T
             z, down = place[2], score[2] < 0
             free = np.ones(p, dtype=bool)
-            free[2] = not (z <= self.z_range_nm[0] if down else z >= self.z_range_nm[1])
+            free[2] = not (z <= self.of.z_range_nm[0] if down else z >= self.of.z_range_nm[1])
             inside = np.ix_(free, free)
             inverse[b][inside] = np.linalg.inv(fisher[:p, :p][inside])
             values[b], scores[b], mixed[b] = terms.value, score[:p], fisher[:p, p:]
             known[b] = fisher[p:, p:] - mixed[b].T @ inverse[b] @ mixed[b]
             pulls[b] = score[p:] - mixed[b].T @ inverse[b] @ score[:p]
-        value, shares = _shared(values, owners, len(self.likelihoods))
+        value, shares = _shared(values, owners, len(self.of.likelihoods))
         pull, prior = shares @ pulls, np.zeros((k, k))
-        diameter = self.model.sphere.of_mass(mass).diameter_nm
+        diameter = self.of.model.sphere.of_mass(mass).diameter_nm
         if self.motion is not None:
             off, slope = 1 / diameter - self.motion[0], -1 / (3 * mass * diameter)
             value -= 0.5 * (off / self.motion[1]) ** 2
             pull[0] -= off * slope / self.motion[1] ** 2
             prior[0, 0] = (slope / self.motion[1]) ** 2
-        information = _of_frames(known, pulls, shares, owners, len(self.likelihoods))
+        information = _of_frames(known, pulls, shares, owners, len(self.of.likelihoods))
         expected = np.tensordot(shares, known, axes=1) + prior
         return _Frames(
             value, pull, expected, information, prior, values, shares, scores, inverse, mixed,
@@ -414,9 +414,10 @@ def _bias(
     """Bias of c that places which follow the noise of their frame make."""
     total = np.zeros(common.size)
     mass = float(common[0])
-    linear = joint.model if common.size == 1 else joint.model.of_index(float(common[1]))
+    model = joint.of.model
+    linear = model if common.size == 1 else model.of_index(float(common[1]))
     for b, (place, f) in enumerate(zip(rows, owners, strict=True)):
-        likelihood = joint.likelihoods[f]
+        likelihood = joint.of.likelihoods[f]
         terms, slopes = joint.terms(likelihood, place, common)
         bends = linear.at(mass).derivative_rows(likelihood.grid, np.array([*place[:3], mass]))
         inverse, p = here.place_inverse[b], place.size
@@ -454,13 +455,18 @@ class IndexFit(NamedTuple):
 
 def fit_index(likelihood: Likelihood, fit: FitResult, z_range_nm: tuple[float, float]) -> IndexFit:
     """Fit the index as well, from every likely diameter; the fit stays where that tells nothing."""
-    model = _model_of(likelihood)
-    found = _maxima(likelihood, model, fit, z_range_nm)
     before = _covariance(likelihood, fit)
-    if found:
+    if found := _maxima(likelihood, fit, z_range_nm):
         best, *others = found
-        own, again, covariance = _refitted(likelihood, model, fit, best, z_range_nm)
-        if _is_told(likelihood, own, fit, again, (before, covariance)):
+        index, pixel = best.index - float(best.bias[1]), likelihood.grid.pixel_nm
+        own = replace(likelihood, model=_model_of(likelihood).of_index(index))
+        x, y, z, *_ = best.places[0].tolist()
+        start = Candidate(x / pixel, y / pixel, z, best.mass_kda, fit.snr)
+        again = fit_particle(own, start, "size", z_range_nm, level=bool(fit.box.free[LEVEL]))
+        again = again.shifted(fit.x_nm - float(fit.estimate[0]), fit.y_nm - float(fit.estimate[1]))
+        covariance = _covariance(own, again)
+        errors = [math.sqrt(each[INDEX, INDEX]) for each in (before, covariance)]
+        if _is_told(likelihood, own, fit, again, errors):
             again = _with_errors(again, covariance, others)
             return IndexFit(own, again, *_combination(own, again, covariance))
     return IndexFit(likelihood, fit, *_combination(likelihood, fit, before))
@@ -473,32 +479,8 @@ def _model_of(likelihood: Likelihood) -> SizedModel:
     return likelihood.model
 
 
-def _refitted(
-    likelihood: Likelihood,
-    model: SizedModel,
-    fit: FitResult,
-    best: CommonSize,
-    z_range_nm: tuple[float, float],
-) -> tuple[Likelihood, FitResult, FloatArray]:
-    """Fit the sphere again with the index that was found, and give the covariance with the index.
-
-    Shapes: covariance (6, 6), of θ with the index.
-    """
-    own = replace(likelihood, model=model.of_index(best.index - float(best.bias[1])))
-    pixel = likelihood.grid.pixel_nm
-    x, y, z, *_ = best.places[0].tolist()
-    start = Candidate(x / pixel, y / pixel, z, best.mass_kda, fit.snr)
-    again = fit_particle(own, start, "size", z_range_nm, level=bool(fit.box.free[LEVEL]))
-    again = again.shifted(fit.x_nm - float(fit.estimate[0]), fit.y_nm - float(fit.estimate[1]))
-    return own, again, _covariance(own, again)
-
-
 def _is_told(
-    likelihood: Likelihood,
-    own: Likelihood,
-    fit: FitResult,
-    again: FitResult,
-    covariances: Sequence[FloatArray],
+    likelihood: Likelihood, own: Likelihood, fit: FitResult, again: FitResult, errors: list[float]
 ) -> bool:
     """Tell whether the index is known to better than half of its contrast.
 
@@ -512,47 +494,41 @@ def _is_told(
     # a fit may end so much below the one that it began from
     if Status.AT_BOUND in again.flags or gain < -0.5:
         return False
-    errors = [math.sqrt(covariance[INDEX, INDEX]) for covariance in covariances]
-    errors.append(abs(index - known) / math.sqrt(max(2 * gain, 1.0)))
-    return max(errors) < UNDETERMINED * abs(index - model.optics.n_sample)
+    way = abs(index - known) / math.sqrt(max(2 * gain, 1.0))
+    return max(*errors, way) < UNDETERMINED * abs(index - model.optics.n_sample)
 
 
 def _with_errors(fit: FitResult, covariance: FloatArray, others: Sequence[CommonSize]) -> FitResult:
     """Give a fit the errors with the index free, and a flag for another likely diameter."""
     errors = np.sqrt(np.diag(covariance))
     apart = OTHER_SIZE * errors[AMPLITUDE]
-    flags = list(fit.flags)
-    if any(abs(other.mass_kda - fit.mass_kda) > apart for other in others):
-        flags.append(Status.AMBIGUOUS_SIZE)
-    status, noticed = verdict(flags)
+    several = any(abs(one.mass_kda - fit.mass_kda) > apart for one in others)
+    status, noticed = verdict([*fit.flags, *([Status.AMBIGUOUS_SIZE] if several else [])])
     return replace(
         fit, sigma=errors[:4], sigma_index=float(errors[INDEX]), status=status, flags=noticed
     )
 
 
 def _maxima(
-    likelihood: Likelihood, model: SizedModel, fit: FitResult, z_range_nm: tuple[float, float]
+    likelihood: Likelihood, fit: FitResult, z_range_nm: tuple[float, float]
 ) -> list[CommonSize]:
     """Find the maxima of the likelihood in place, diameter and index that are likely, best first.
 
     They begin at the diameters and heights that are likely at the configured index.
     """
+    frame = SphereFrames([likelihood], _model_of(likelihood), z_range_nm)
     x, y, z, mass, level = fit.theta.tolist()
     levels = [level] if fit.box.free[LEVEL] else []
+    index = frame.model.sphere.index.real
     starts = [(z, mass), *((other.z_nm, other.mass_kda) for other in fit.alternatives)]
     tried = [
-        fit_common_size(
-            [likelihood], model, np.array([[x, y, height, *levels]]), z_range_nm,
-            mass_kda=size, index=model.sphere.index.real,
-        )
+        frame.fit(np.array([[x, y, height, *levels]]), mass_kda=size, index=index)
         for height, size in starts
-    ]  # fmt: skip
-    found = sorted(
-        (one for one in tried if one is not None and one.converged),
-        key=lambda one: -one.log_likelihood,
-    )
-    least = found[0].log_likelihood - math.log(AMBIGUITY_ODDS) if found else math.inf
-    return [one for one in found if one.log_likelihood > least]
+    ]
+    found = [one for one in tried if one is not None and one.converged]
+    highest = max((one.log_likelihood for one in found), default=0.0)
+    found = [one for one in found if one.log_likelihood > highest - math.log(AMBIGUITY_ODDS)]
+    return sorted(found, key=lambda one: -one.log_likelihood)
 
 
 def _combination(

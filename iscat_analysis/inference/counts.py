@@ -46,8 +46,7 @@ def conditional(
     after_e: ArrayLike,
     power_ratio: ArrayLike,
     *,
-    read_variance_before_e2: ArrayLike = 0.0,
-    read_variance_after_e2: ArrayLike = 0.0,
+    read_variances_e2: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
     masked: ArrayLike | None = None,
 ) -> Likelihood:
     """Binomial likelihood of counts before and after landing.
@@ -58,9 +57,7 @@ def conditional(
     before = pixels_of("before_e", before_e, grid.shape, masked)
     after = pixels_of("after_e", after_e, grid.shape, masked)
     ratio = pixels_of("power_ratio", power_ratio, grid.shape, masked, scalar=True)
-    read_before, read_after = _read_variances(
-        (read_variance_before_e2, read_variance_after_e2), grid, masked
-    )
+    read_before, read_after = _read_variances(read_variances_e2, grid, masked)
     if not np.any(ratio > 0):
         raise DataError(
             f"power_ratio = {float(ratio.flat[0]):g}: give the light after over that before, a "
@@ -68,15 +65,11 @@ def conditional(
         )
     usable = (before > 0) & (after > 0) & (ratio > 0) & ~masked
     ratio = np.where(usable, ratio, 1.0)
-    data = np.zeros((4, *grid.shape))
-    total = before + after
-    p = ratio / (1 + ratio)
+    total, p = before + after, ratio / (1 + ratio)
     shot = total * p * (1 - p)
     read = (1 - p) ** 2 * read_after + p**2 * read_before
-    data[0], data[1], data[2] = after, total, ratio
-    data[3] = shot / np.where(usable, shot + read, 1.0)
-    if not usable.all():
-        data[:, ~usable] = 0.0
+    data = np.stack([after, total, ratio, shot / np.where(usable, shot + read, 1.0)])
+    data[:, ~usable] = 0.0
     return Likelihood(model, grid, CONDITIONAL, data)
 
 
@@ -107,13 +100,10 @@ def poisson(
     """
     masked = mask_of("masked", masked, grid.shape)
     counts = pixels_of("counts_e", counts_e, grid.shape, masked)
+    names = "background_e", "scale_e", "extra_variance_e2"
     background, scale, extra = (
         pixels_of(name, value, grid.shape, masked, scalar=True)
-        for name, value in (
-            ("background_e", background_e),
-            ("scale_e", scale_e),
-            ("extra_variance_e2", extra_variance_e2),
-        )
+        for name, value in zip(names, (background_e, scale_e, extra_variance_e2), strict=True)
     )
     if not np.any(scale > 0):
         raise DataError(
@@ -216,8 +206,7 @@ def counts_likelihood(
     noise: NoiseLaw,
     scale_e: float | None = None,
     others: FloatArray | None = None,
-    read_variance_before_e2: ArrayLike = 0.0,
-    read_variance_after_e2: ArrayLike = 0.0,
+    read_variances_e2: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
     masked: BoolArray | None = None,
 ) -> Likelihood:
     """Likelihood of a region's counts.
@@ -226,26 +215,16 @@ def counts_likelihood(
     """
     signal = np.zeros(grid.shape) if others is None else others
     if noise == CONDITIONAL:
-        return conditional(
-            model, grid, before_e, after_e, power_ratio * (1 + signal),
-            read_variance_before_e2=read_variance_before_e2,
-            read_variance_after_e2=read_variance_after_e2,
-            masked=masked,
-        )  # fmt: skip
+        counts = before_e, after_e, power_ratio * (1 + signal)
+        return conditional(model, grid, *counts, read_variances_e2=read_variances_e2, masked=masked)
     masked = mask_of("masked", masked, grid.shape)
     before = pixels_of("before_e", before_e, grid.shape, masked, scalar=True)
-    read_before, read_after = _read_variances(
-        (read_variance_before_e2, read_variance_after_e2), grid, masked
-    )
+    read_before, read_after = _read_variances(read_variances_e2, grid, masked)
     steady = smooth_background(before, read_before, masked) if background else before
     # The expected variance is that of the smooth background; the excess is that over the own one.
     extra = read_after + power_ratio**2 * (background * steady + read_before)
     extra = extra + power_ratio * (steady - before)
-    level = power_ratio * before
+    level = scale = power_ratio * before * (1 + signal)
     if scale_e is not None:
-        return poisson(
-            model, grid, after_e, level + scale_e * signal, scale_e,
-            extra_variance_e2=extra, masked=masked,
-        )  # fmt: skip
-    level = level * (1 + signal)
-    return poisson(model, grid, after_e, level, level, extra_variance_e2=extra, masked=masked)
+        level, scale = power_ratio * before + scale_e * signal, np.asarray(scale_e)
+    return poisson(model, grid, after_e, level, scale, extra_variance_e2=extra, masked=masked)

@@ -36,9 +36,8 @@ bias of order 1/N is taken off.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
-from functools import partial
 from itertools import compress
 from typing import NamedTuple
 
@@ -48,7 +47,6 @@ from scipy.special import gammaincc
 from iscat_analysis._kernels.goodness import count_and_test
 from iscat_analysis._kernels.hessian import ROWS, errors_and_bias
 from iscat_analysis.inference.counts import poisson
-from iscat_analysis.inference.heights import HeightPrior
 from iscat_analysis.inference.laws import MANY_COUNTS
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, ModelLikelihood
 from iscat_analysis.inference.maximiser import Optimum, covariance_of
@@ -56,9 +54,8 @@ from iscat_analysis.inference.sizes import (
     AMBIGUITY_ODDS,
     OTHER_SIZE_SHARE,
     has_other_size,
-    scanned_heights,
     size_probability,
-    size_starts,
+    starts_of,
 )
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.pixels import PixelGrid
@@ -115,51 +112,34 @@ def window_nm(pixel_nm: float) -> float:
 
 def search_box(
     likelihood: Likelihood,
-    start: Candidate,
+    theta: FloatArray,
     mode: str,
     z_range_nm: tuple[float, float],
     *,
     level: bool = False,
 ) -> Box:
-    """Bounds of the search around a start."""
-    return _box_around(likelihood, start_theta(likelihood, start), mode, z_range_nm, level)
+    """Bounds of the search around a start.
 
-
-def _box_around(
-    likelihood: Likelihood,
-    theta: FloatArray,
-    mode: str,
-    z_range_nm: tuple[float, float],
-    level: bool,
-) -> Box:
-    """Bounds of the search around θ; see `search_box`."""
-    names = FREE_PARAMETERS[mode]
-    prior = likelihood.prior
-    grid = likelihood.grid
+    Shapes: `theta` (5,).
+    """
+    names, model, grid = FREE_PARAMETERS[mode], likelihood.model, likelihood.grid
     reach, half = window_nm(grid.pixel_nm), grid.pixel_nm / 2
     x, y, _, amplitude, _ = fixed = theta.tolist()
-    largest = 100 * max(abs(amplitude), abs(likelihood.model.nominal_amplitude))
-    smallest = 0.0
-    if isinstance(likelihood.model, SizedModel):
-        smallest, largest = likelihood.model.mass_range_kda
-    signed = "z_nm" not in names and likelihood.model.rho > 0 and not smallest
-    if prior is not None:
-        names, z_range_nm = (*names, "z_nm"), _searched(prior, likelihood.model.z_range_nm)
+    smallest, largest = 0.0, 100 * max(abs(amplitude), abs(model.nominal_amplitude))
+    if isinstance(model, SizedModel):
+        smallest, largest = model.mass_range_kda
+    elif "z_nm" not in names and model.rho > 0:
+        smallest = -largest
+    if likelihood.prior is not None:
+        low, high = likelihood.prior.range_nm
+        z_range_nm = max(low, model.z_range_nm[0]), min(high, model.z_range_nm[1])
+        names = (*names, "z_nm")
     free = [name in names for name in PARAMETERS] + [level]
     left, right = grid.x_nm.item(0) - half, grid.x_nm.item(-1) + half
     top, bottom = grid.y_nm.item(0) - half, grid.y_nm.item(-1) + half
-    lower = (
-        max(x - reach, left), max(y - reach, top), z_range_nm[0],
-        -largest if signed else smallest, -1.0,
-    )  # fmt: skip
+    lower = max(x - reach, left), max(y - reach, top), z_range_nm[0], smallest, -1.0
     upper = min(x + reach, right), min(y + reach, bottom), z_range_nm[1], largest, 1.0
     return Box(np.array(free), np.where(free, lower, fixed), np.where(free, upper, fixed))
-
-
-def _searched(prior: HeightPrior, known_nm: tuple[float, float]) -> tuple[float, float]:
-    """Range of heights in which a prior and a model let a particle be searched."""
-    low, high = prior.range_nm
-    return max(low, known_nm[0]), min(high, known_nm[1])
 
 
 def fit_particle(
@@ -173,7 +153,7 @@ def fit_particle(
 ) -> FitResult:
     """Fit one particle."""
     begin = start_theta(likelihood, start)
-    box = _box_around(likelihood, begin, mode, z_range_nm, level)
+    box = search_box(likelihood, begin, mode, z_range_nm, level=level)
     optima, all_followed = _optima(likelihood, begin, box)
     found = _judged(likelihood, optima[0], box)
     if not all_followed and not found.p_value >= POOR_FIT_P:
@@ -188,27 +168,25 @@ def fit_particle(
     model = likelihood.model
     optima = _distinct(optima, model)
     alternatives = _alternatives(optima)
-    flags = []
-    if not best.converged or not known:
-        flags.append(Status.NOT_CONVERGED)
-    if _at_bound(likelihood, best.theta, found.walls, sigma[2]):
-        flags.append(Status.AT_BOUND)
-    if alternatives and alternatives[0].log_likelihood_gap < math.log(AMBIGUITY_ODDS):
-        flags.append(Status.AMBIGUOUS_Z)
-    if model.is_sized and has_other_size(alternatives, best, float(sigma[AMPLITUDE])):
-        flags.append(Status.AMBIGUOUS_SIZE)
-    probability = math.nan
-    if model.is_sized and known and box.free[AMPLITUDE]:
-        probability = size_probability(likelihood, optima, box, float(sigma[AMPLITUDE]))
-    if found.p_value < POOR_FIT_P:
-        flags.append(Status.POOR_FIT)
-    estimate = best.theta
+    estimate, sigma_kda = best.theta, float(sigma[AMPLITUDE])
     if correct_bias and known and _is_small(bias, sigma, box, found.slope):
-        estimate = np.minimum(np.maximum(estimate - bias, box.lower), box.upper)
-    x, y, z, amplitude = (float(value) for value in estimate[:4])
-    if box.free[AMPLITUDE] and model.scale.off_line(estimate[AMPLITUDE], sigma[AMPLITUDE], OUTWARD):
-        flags.append(Status.AT_BOUND)
-    status, noticed = verdict(flags)
+        estimate = _inside(estimate - bias, box)
+    x, y, z, amplitude = estimate[:4].tolist()
+    sized = model.is_sized and bool(box.free[AMPLITUDE])
+    pair = estimate[AMPLITUDE], sigma[AMPLITUDE]
+    off_line = bool(box.free[AMPLITUDE] and model.scale.off_line(*pair, OUTWARD))
+    gap = alternatives[0].log_likelihood_gap if alternatives else math.inf
+    flags = {
+        Status.NOT_CONVERGED: not (best.converged and known),
+        Status.AT_BOUND: off_line or _at_bound(likelihood, best.theta, found.walls, sigma[2]),
+        Status.AMBIGUOUS_Z: gap < math.log(AMBIGUITY_ODDS),
+        Status.AMBIGUOUS_SIZE: model.is_sized and has_other_size(alternatives, best, sigma_kda),
+        Status.POOR_FIT: found.p_value < POOR_FIT_P,
+    }
+    probability = math.nan
+    if sized and known:
+        probability = size_probability(likelihood, optima, box, sigma_kda)
+    status, noticed = verdict([flag for flag, applies in flags.items() if applies])
     return FitResult(
         x_nm=x,
         y_nm=y,
@@ -255,16 +233,15 @@ def fit_model(likelihood: ModelLikelihood, start: FloatArray, box: Box) -> Model
 
     Shapes: `start` (p,).
     """
-    found = likelihood.maximize(start, box.free, box.lower, box.upper)
+    found = likelihood.maximize(start, box)
     covariance = covariance_of(found.fisher, box.free)
     return ModelFit(found.theta, box, covariance, found.log_likelihood, found.converged)
 
 
 def detection_snr(likelihood: Likelihood, best: Optimum, box: Box) -> float:
     """Signal-to-noise ratio of a particle: √(2 Δℓ) against the same light without it."""
-    return math.sqrt(
-        2 * max(best.log_likelihood - without_particle(likelihood, best.theta, box), 0.0)
-    )
+    gain = best.log_likelihood - without_particle(likelihood, best.theta, box)
+    return math.sqrt(2 * max(gain, 0.0))
 
 
 def without_particle(likelihood: Likelihood, theta: FloatArray, box: Box) -> float:
@@ -279,10 +256,9 @@ def without_particle(likelihood: Likelihood, theta: FloatArray, box: Box) -> flo
     if box.free[LEVEL]:
         alone = np.arange(box.free.size) == LEVEL
         empty = theta.copy()
-        empty[AMPLITUDE] = 0.0
-        empty[LEVEL] = 0.0
+        empty[[AMPLITUDE, LEVEL]] = 0.0
         lower, upper = (np.where(alone, end, empty) for end in (box.lower, box.upper))
-        return likelihood.maximize(empty, alone, lower, upper).log_likelihood
+        return likelihood.maximize(empty, Box(alone, lower, upper)).log_likelihood
     return 0.0 if likelihood.prior is None else float(likelihood.prior.log_density(theta[2]))
 
 
@@ -296,6 +272,16 @@ def start_theta(likelihood: Likelihood, start: Candidate) -> FloatArray:
     return np.array([start.x_px * pixel, start.y_px * pixel, start.z_nm, amplitude, 0.0])
 
 
+def candidate_at(likelihood: Likelihood, theta: FloatArray, snr: float = 0.0) -> Candidate:
+    """Convert θ to a candidate.
+
+    Shapes: `theta` (5,).
+    """
+    x, y, z, amplitude, _ = theta.tolist()
+    pixel, mass = likelihood.grid.pixel_nm, likelihood.model.scale.mass(np.asarray(amplitude))
+    return Candidate(x / pixel, y / pixel, z, float(mass), snr)
+
+
 def _optima(likelihood: Likelihood, theta: FloatArray, box: Box) -> tuple[list[Optimum], bool]:
     """Every optimum that was reached, best first, and whether all starts were followed.
 
@@ -303,39 +289,23 @@ def _optima(likelihood: Likelihood, theta: FloatArray, box: Box) -> tuple[list[O
     the scan, and where it is none of its maxima, a plain particle is found without it; it is left
     out then, unless there is no reference and so no fringes that a scan could follow.
     """
-    theta = _inside(theta, box)
-    model = likelihood.model
-    if isinstance(model, SizedModel) and box.free[2] and box.free[AMPLITUDE]:
-        starts = size_starts(likelihood, model, theta, box)
-        return _ranked(_followed(likelihood, starts, box)), True
+    theta, model = _inside(theta, box), likelihood.model
     if not box.free[2]:
-        return [likelihood.maximize(theta, box.free, box.lower, box.upper)], True
+        return [likelihood.maximize(theta, box)], True
     optima: list[Optimum] = []
     best, plain = -math.inf, False
-    for begin, value in _heights(likelihood, theta, box):
-        if box.free[3] and begin[3] == 0.0 and best > 0.0:
+    sized = isinstance(model, SizedModel) and bool(box.free[AMPLITUDE])
+    for begin, value in starts_of(likelihood, theta, box):
+        if box.free[AMPLITUDE] and begin[AMPLITUDE] == 0.0 and best > 0.0:
             optima.append(Optimum(begin, value, 0, False, _NOTHING_KNOWN))  # no particle there
             continue
-        found = _follow(likelihood, begin, box, best)
+        found = _follow(likelihood, _inside(begin, box), box, best)
         optima.append(found)
         if found.converged and found.log_likelihood > best:
             best, plain = found.log_likelihood, _is_plain(found)
-    enough = plain and likelihood.model.rho > 0
-    if not enough:
-        optima.append(_follow(likelihood, theta, box, best))
-    return _ranked(optima), not enough
-
-
-def _followed(likelihood: Likelihood, starts: Sequence[FloatArray], box: Box) -> list[Optimum]:
-    """Fit from every start, the best first."""
-    optima: list[Optimum] = []
-    best = -math.inf
-    for start in starts:
-        found = _follow(likelihood, _inside(start, box), box, best)
-        optima.append(found)
-        if found.converged:
-            best = max(best, found.log_likelihood)
-    return optima
+    if optima and (sized or (plain and model.rho > 0)):
+        return _ranked(optima), sized
+    return _ranked([*optima, _follow(likelihood, theta, box, best)]), True
 
 
 def _inside(theta: FloatArray, box: Box) -> FloatArray:
@@ -345,7 +315,7 @@ def _inside(theta: FloatArray, box: Box) -> FloatArray:
 
 def _follow(likelihood: Likelihood, theta: FloatArray, box: Box, best: float) -> Optimum:
     """Fit from a start, and give up when it cannot end within `FOLLOWED` of the best."""
-    return likelihood.maximize(theta, box.free, box.lower, box.upper, least=best - FOLLOWED)
+    return likelihood.maximize(theta, box, least=best - FOLLOWED)
 
 
 def _ranked(optima: list[Optimum]) -> list[Optimum]:
@@ -373,11 +343,9 @@ def _judged(likelihood: Likelihood, best: Optimum, box: Box) -> _Found:
     chi2_reduced, p_value = goodness_of_fit(likelihood, best.theta, box.free, derivatives)
     walls = _walls(best.theta, box)
     slope = abs(likelihood.model.scale.slope(float(best.theta[AMPLITUDE])))
-    known, sigma, covariance, bias = precision(
-        likelihood, best.theta, best.fisher, box.free, derivatives, walls=walls,
-        slope=slope,
-    )  # fmt: skip
-    return _Found(best, chi2_reduced, p_value, walls, slope, known, sigma, covariance, bias)
+    at = likelihood, best.theta, best.fisher, box.free, derivatives
+    errors = precision(*at, walls=walls, slope=slope)
+    return _Found(best, chi2_reduced, p_value, walls, slope, *errors)
 
 
 def _also_from(
@@ -407,26 +375,6 @@ def _is_plain(found: Optimum) -> bool:
     """Whether a particle is significant against a mere change of the level."""
     alone = 0.5 * found.theta[AMPLITUDE] ** 2 * found.fisher[AMPLITUDE, AMPLITUDE]
     return bool(min(found.log_likelihood, alone) > PLAIN)
-
-
-def _heights(likelihood: Likelihood, theta: FloatArray, box: Box) -> list[tuple[FloatArray, float]]:
-    """Start at the local maxima of the likelihood along z, best first.
-
-    Each start is θ with a maximum's height and amplitude; beside it the log-likelihood there.
-    """
-    low, high, given = float(box.lower[2]), float(box.upper[2]), float(theta[2])
-    heights = sorted({*scanned_heights(likelihood.model, low, high).tolist(), given})
-    bounds = (float(box.lower[3]), float(box.upper[3])) if box.free[3] else None
-    values, amplitudes = likelihood.scan_heights(np.array(heights), theta, bounds)
-    padded = [-math.inf, *values.tolist(), -math.inf]
-    peaks = [i for i in range(len(heights)) if padded[i] <= padded[i + 1] >= padded[i + 2]]
-    starts = []
-    # maxima of the scan that are followed
-    for i in sorted(peaks, key=lambda i: -padded[i + 1])[:8]:
-        begin = theta.copy()
-        begin[2], begin[3] = heights[i], amplitudes[i]
-        starts.append((begin, padded[i + 1]))
-    return starts
 
 
 def _distinct(optima: list[Optimum], model: ForwardModel) -> list[Optimum]:
@@ -648,24 +596,12 @@ def compile_kernels(model: ForwardModel, parts: Collection[str]) -> None:
     margin = np.array([1.0, 1.0, 0.0, 1.0, 0.0])
     free = np.array([True, True, "heights" in parts, True, False])
     derivatives = np.random.default_rng(1).normal(size=(grid.shape[0], ROWS, grid.shape[1]))
-
-    def maximise() -> None:
-        likelihood.maximize(theta, free, theta - margin, theta + margin, passes=2)
-
-    def differentiate() -> None:
-        likelihood.derivatives(theta, free)
-
-    calls: list[Callable[[], object]] = [
-        lambda: likelihood.score_fisher(theta),
-        lambda: precision(likelihood, theta, np.eye(5), free, derivatives),
-        lambda: goodness_of_fit(likelihood, theta, free, derivatives),
-    ]
     if "heights" in parts:
-        scan = partial(likelihood.scan_heights, theta[2:3], theta, (0.0, 2.0))
-        calls = [scan, maximise, *calls, differentiate]
-    else:
-        calls = [maximise, differentiate, *calls]
+        likelihood.scan_heights(theta[2:3], theta, (0.0, 2.0))
+    likelihood.maximize(theta, Box(free, theta - margin, theta + margin), passes=2)
+    likelihood.score_fisher(theta)
+    precision(likelihood, theta, np.eye(5), free, derivatives)
+    goodness_of_fit(likelihood, theta, free, derivatives)
+    likelihood.derivatives(theta, free)
     if "posteriors" in parts:
-        calls.append(lambda: likelihood.values(theta[None], pictured=True))
-    for call in calls:
-        call()
+        likelihood.values(theta[None], pictured=True)

@@ -20,7 +20,6 @@ information once all else is fitted.  With heights of mean μ and variance s² t
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,7 +44,6 @@ class HeightPrior:
     @property
     def range_nm(self) -> tuple[float, float]:
         """Heights that are searched [nm]."""
-        # Standard deviations of the prior within which the height is searched
         away = 5.0 * self.sd_nm
         return self.mean_nm - away, self.mean_nm + away
 
@@ -57,9 +55,9 @@ class HeightPrior:
 
 def height_prior(config: Config, mass_kda: float) -> HeightPrior | None:
     """Give the prior of the height; None where the height is fixed or free."""
-    particle = config.particle
     if not has_prior(config):
         return None
+    particle = config.particle
     return HeightPrior(particle.mean_height_nm(mass_kda), particle.height_prior_sd_nm)
 
 
@@ -134,8 +132,6 @@ def spread_of_heights(z_nm: FloatArray, sigma_nm: FloatArray) -> HeightSpread | 
     fallen = 2 * (value[best] - value)
     low = float(np.interp(_IN_95, fallen[best::-1], widths[best::-1]))
     high = float(np.interp(_IN_95, fallen[best:], widths[best:]))
-    return HeightSpread(
-        float(mean[best]), math.sqrt(1 / float((1 / total[best]).sum())),
-        float(widths[best]), low, high,
-        2 * float(value[best] - value[0]), int(z.size),
-    )  # fmt: skip
+    error = float((1 / total[best]).sum()) ** -0.5
+    excess, width = 2 * float(value[best] - value[0]), float(widths[best])
+    return HeightSpread(float(mean[best]), error, width, low, high, excess, int(z.size))

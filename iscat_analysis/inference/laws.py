@@ -94,17 +94,12 @@ class NoiseLaw(ABC):
 
     @abstractmethod
     def count_response(
-        self,
-        data: FloatArray,
-        signal: FloatArray,
-        level: float,
-        before: FloatArray,
-        ratio: float | None,
+        self, data: FloatArray, signal: FloatArray, level: float, before: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Give ∂score/∂count, of a count before the step and of one after it.
 
-        `before` are the counts that the background was measured with, `ratio` is the light after
-        over that before; None where the signal is a share of the background.
+        `before` are the counts that the background was measured with, of which the signal is a
+        share.
         """
 
     @abstractmethod
@@ -141,15 +136,10 @@ class Conditional(NoiseLaw):
         return np.asarray(data[0] / ((data[1] - data[0]) * data[2]) - 1)
 
     def count_response(
-        self,
-        data: FloatArray,
-        signal: FloatArray,
-        level: float,
-        before: FloatArray,
-        ratio: float | None,
+        self, data: FloatArray, signal: FloatArray, level: float, before: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Give ∂score/∂count: a count before adds to the sum alone, a count after to both."""
-        del before, ratio
+        del before
         bright = np.maximum(1 + signal, noise.FLOOR)
         p = 1 - 1 / (1 + data[2] * level * bright)
         return -data[3] * p / bright, data[3] * (1 - p) / bright
@@ -196,18 +186,12 @@ class Poisson(NoiseLaw):
         return np.asarray(np.minimum(super().signal_information(data, signal), data[2] ** 2))
 
     def count_response(
-        self,
-        data: FloatArray,
-        signal: FloatArray,
-        level: float,
-        before: FloatArray,
-        ratio: float | None,
+        self, data: FloatArray, signal: FloatArray, level: float, before: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Give ∂score/∂count: a count before raises the expected light."""
         light = level * (data[1] + data[2] * signal)
         after = level * data[2] / np.maximum(light + data[3], noise.FLOOR)
-        counted = light / np.maximum(before, noise.FLOOR) if ratio is None else ratio
-        return -counted * after, after
+        return -light / np.maximum(before, noise.FLOOR) * after, after
 
     def multiplied(self, data: FloatArray, factor: FloatArray) -> FloatArray:
         """Multiply the expected counts, with and without the particle."""

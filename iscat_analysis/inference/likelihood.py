@@ -21,7 +21,6 @@ from functools import cached_property
 
 import numpy as np
 
-from iscat_analysis._kernels.hessian import observed_information
 from iscat_analysis._kernels.lens import Lens, Pixels
 from iscat_analysis._kernels.noise import Measured
 from iscat_analysis._kernels.radial import AxialTable
@@ -154,20 +153,13 @@ class ModelLikelihood:
         return terms.value, score, (rows * terms.information.ravel()) @ rows.T
 
     def maximize(
-        self,
-        start: FloatArray,
-        free: BoolArray,
-        lower: FloatArray,
-        upper: FloatArray,
-        *,
-        tolerance: float = TOLERANCE,
-        least: float = -math.inf,
+        self, start: FloatArray, box: Box, *, tolerance: float = TOLERANCE, least: float = -math.inf
     ) -> Optimum:
         """Maximise by damped Fisher scoring inside a box.
 
-        Shapes: `start, lower, upper, free` (p,).
+        Shapes: `start` (p,).
         """
-        theta, box = self._checked(start, free, lower, upper)
+        theta, box = self._checked(start, box)
         return maximise(
             self.score_fisher, theta, box, self.farthest, tolerance=tolerance, least=least
         )
@@ -196,14 +188,12 @@ class ModelLikelihood:
         s = np.zeros(self.grid.shape) if signal is None else signal
         return self.noise.signal_information(self.data, s)
 
-    def _checked(
-        self, start: FloatArray, free: BoolArray, lower: FloatArray, upper: FloatArray
-    ) -> tuple[FloatArray, Box]:
+    def _checked(self, start: FloatArray, box: Box) -> tuple[FloatArray, Box]:
         """Check the shapes of a start and of a box, and whether one is inside the other."""
         shape = (len(self.parameters),)
         theta = vector_of("start", start, shape).copy()
-        lower, upper = vector_of("lower", lower, shape), vector_of("upper", upper, shape)
-        free = np.ascontiguousarray(free, dtype=np.bool_)
+        lower, upper = vector_of("lower", box.lower, shape), vector_of("upper", box.upper, shape)
+        free = np.ascontiguousarray(box.free, dtype=np.bool_)
         if free.shape != shape:
             raise DataError(f"free: has shape {free.shape} where {shape} is needed")
         if not np.all(~free | ((theta >= lower) & (theta <= upper))):
@@ -235,16 +225,15 @@ class Likelihood(ModelLikelihood):
         """As `ModelLikelihood.values`."""
         points = vector_of("thetas", thetas, (-1, 5))
         inside = self.supports(points)
-        out = np.full(len(points), -np.inf)
-        if not inside.any():
+        out, known = np.full(len(points), -np.inf), points[inside]
+        if not len(known):
             return out
         if self.model.is_sized:  # each mass has its own picture
             out[inside] = [
                 self.noise.terms(self.data, self.signal(point), float(point[LEVEL])).value
-                for point in points[inside]
+                for point in known
             ]
             return out
-        known = points if inside.all() else points[inside]
         lens, table = self._table(known, pictured=pictured)
         out[inside] = value_batch(table, lens, *self._arguments[1:], known)
         out[np.isnan(out)] = -np.inf  # an amplitude so large that the light overflows
@@ -272,9 +261,7 @@ class Likelihood(ModelLikelihood):
     def maximize(
         self,
         start: FloatArray,
-        free: BoolArray,
-        lower: FloatArray,
-        upper: FloatArray,
+        box: Box,
         *,
         tolerance: float = TOLERANCE,
         passes: int = PASSES,
@@ -282,8 +269,8 @@ class Likelihood(ModelLikelihood):
     ) -> Optimum:
         """As `ModelLikelihood.maximize`; a box that leaves the support is refused."""
         if self.model.is_sized:
-            return super().maximize(start, free, lower, upper, tolerance=tolerance, least=least)
-        theta, box = self._checked(start, free, lower, upper)
+            return super().maximize(start, box, tolerance=tolerance, least=least)
+        theta, box = self._checked(start, box)
         free, lower, upper = box.free, box.lower, box.upper
         lens, pixels, measured = self._arguments
         if free[2]:
@@ -306,19 +293,16 @@ class Likelihood(ModelLikelihood):
         Shapes: `heights` (n,), `theta` (5,), `values, amplitudes` (n,).
         """
         heights, point = vector_of("heights", heights, (-1,)), vector_of("theta", theta, (5,))
-        points = np.empty((heights.size, 5))
-        points[:] = point
+        points = np.tile(point, (heights.size, 1))
         points[:, 2] = heights
         inside = self.supports(points)
-        known = heights if inside.all() else heights[inside]
+        known = heights[inside]
         lens, pixels, measured = self._arguments
         picture = tuple(self.model.axial_table), tuple(lens), tuple(pixels)
         limits = amplitude_range or (0.0, 0.0)
         found, refitted = scan_heights(picture, measured, known, limits, point)
         if self.prior is not None:
             found += self.prior.log_density(known)
-        if known is heights:
-            return found, refitted
         values, amplitudes = np.full(heights.size, -np.inf), np.full(heights.size, np.nan)
         values[inside], amplitudes[inside] = found, refitted
         return values, amplitudes
@@ -330,16 +314,6 @@ class Likelihood(ModelLikelihood):
         """
         height = "exact" if free is None else "between" if free[2] else "fixed"
         return self.model.derivative_rows(self.grid, self._supported(theta), height)
-
-    def observed_information(self, theta: FloatArray) -> FloatArray:
-        """Negative Hessian of the log-likelihood.
-
-        Shapes: `theta` (5,), result (5, 5).
-        """
-        level, measured = math.exp(theta[LEVEL]), self.measured
-        info: FloatArray = observed_information(measured, level, self.derivatives(theta))
-        info[2, 2] += self.height_prior[1]
-        return info
 
     def residuals(self, theta: FloatArray) -> FloatArray:
         """Give data minus model in standard deviations; NaN where masked.
@@ -363,11 +337,9 @@ class Likelihood(ModelLikelihood):
             )
         return point
 
-    def _checked(
-        self, start: FloatArray, free: BoolArray, lower: FloatArray, upper: FloatArray
-    ) -> tuple[FloatArray, Box]:
+    def _checked(self, start: FloatArray, box: Box) -> tuple[FloatArray, Box]:
         """Refuse a box that a fit could leave the support in as well."""
-        theta, box = super()._checked(start, free, lower, upper)
+        theta, box = super()._checked(start, box)
         if not box_supported((box.free, box.lower, box.upper), theta, *self._support):
             raise ConfigError(
                 f"lower = {_listed(box.lower)}, upper = {_listed(box.upper)}: {self._supports()}; "

@@ -50,6 +50,28 @@ def covariance_of(information: FloatArray, free: BoolArray) -> FloatArray:
     return out
 
 
+def eliminated(information: FloatArray, shared: int) -> FloatArray:
+    """Information about the first parameters after all others are fitted: the Schur complement.
+
+    Shapes: `information` (n, n), result (shared, shared).
+    """
+    cross = information[:shared, shared:]
+    return np.asarray(information[:shared, :shared] + cross @ imitation(information, shared))
+
+
+def imitation(information: FloatArray, shared: int) -> FloatArray:
+    """Change of the last parameters per unit error of the first ones.
+
+    Shapes: `information` (n, n), result (n − shared, shared).
+    """
+    block = information[shared:, shared:]
+    scale = 1 / np.sqrt(np.diag(block))
+    solved = np.linalg.solve(
+        block * np.outer(scale, scale), information[shared:, :shared] * scale[:, None]
+    )
+    return np.asarray(-solved * scale[:, None])
+
+
 def scoring_step(
     score: FloatArray, fisher: FloatArray, active: BoolArray, damping: float
 ) -> FloatArray | None:

@@ -26,6 +26,7 @@ from scipy.special import chdtrc
 from iscat_analysis.inference.fit import fit_model, goodness_of_fit
 from iscat_analysis.inference.laws import PixelTerms
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
+from iscat_analysis.inference.maximiser import imitation
 from iscat_analysis.inference.models import FARTHEST_HALF_NM, Halves
 from iscat_analysis.records import Box, FitResult, FloatArray
 
@@ -98,10 +99,11 @@ def evidence_of(likelihood: Likelihood, fit: FitResult, rise: int = 0) -> FloatA
     fitted = [i for i in range(5) if free[i]]
     round_ = (rows[_XX] + rows[_YY]) / 2
     across = (rows[_XX] - rows[_YY]) / 2
-    spread = _beside(
-        terms, [axes[i] for i in fitted], [round_, across, rows[_XY]],
-        known={fitted.index(Z): likelihood.height_prior} if free[Z] else {}, at_nm=theta[Z],
-    )  # fmt: skip
+    prior = None
+    if free[Z]:
+        mean, information = likelihood.height_prior
+        prior = fitted.index(Z), theta[Z] - mean, information
+    spread = _beside(terms, [axes[i] for i in fitted], [round_, across, rows[_XY]], prior)
     if spread is None:
         return np.array([*own, *NOTHING[3:-1], rise])
     up_, known_, follow = spread
@@ -116,37 +118,33 @@ def _beside(
     terms: PixelTerms,
     fitted: list[FloatArray],
     extra: list[FloatArray],
-    *,
-    known: dict[int, tuple[float, float]] | None = None,
-    at_nm: float = 0.0,
+    known: tuple[int, float, float] | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Give score and information of directions once all that was fitted follows, and how it does.
 
-    `known` holds mean and information of a prior of a fitted one, which is at `at_nm`.
+    `known` holds the number of a fitted one that has a prior, its way from the mean of that, and
+    the information of the prior.
 
     Shapes: results (k,), (k, k), (k, n).
     """
-    all_ = np.array([*fitted, *extra]).reshape(len(fitted) + len(extra), -1)
-    n = len(fitted)
+    k = len(extra)
+    all_ = np.array([*extra, *fitted]).reshape(k + len(fitted), -1)
     score, fisher = all_ @ terms.score.ravel(), (all_ * terms.information.ravel()) @ all_.T
-    for index, (mean, information) in (known or {}).items():
-        score[index] -= information * (at_nm - mean)
-        fisher[index, index] += information
-    diagonal = np.diag(fisher)
-    if not np.all(diagonal > 0):
+    if known is not None:
+        index, away, information = known
+        score[k + index] -= information * away
+        fisher[k + index, k + index] += information
+    if not np.all(np.diag(fisher) > 0):
         return None
-    unit = 1 / np.sqrt(diagonal)
-    scaled = fisher * np.outer(unit, unit)
     try:
-        follow = -np.linalg.solve(scaled[:n, :n], scaled[:n, n:]).T
+        follow = imitation(fisher, k)
     except np.linalg.LinAlgError:
         return None
-    left = scaled[n:, n:] + follow @ scaled[:n, n:]
-    if np.linalg.eigvalsh(left)[0] <= _DEPENDENT:
+    left = fisher[:k, :k] + fisher[:k, k:] @ follow
+    unit = 1 / np.sqrt(np.diag(fisher)[:k])
+    if np.linalg.eigvalsh(left * np.outer(unit, unit))[0] <= _DEPENDENT:
         return None
-    own = 1 / unit[n:]
-    up = (score[n:] * unit[n:] + follow @ (score[:n] * unit[:n])) * own
-    return up, left * np.outer(own, own), follow * unit[:n] / unit[n:, None]
+    return score[:k] + follow.T @ score[k:], left, follow.T
 
 
 _DEPENDENT = 1e-6

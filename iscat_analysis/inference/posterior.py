@@ -168,17 +168,18 @@ def sample_posterior(
         vectorize=True,
     )
     sampler.log_prob_fn = log_probability  # emcee's wrapper prints a traceback on Ctrl-C
-    state = emcee.State(
-        _scatter(proposal, walkers, lower, upper, random), random_state=random.get_state()
-    )
+    width = upper - lower  # draws of the proposal are reflected into the box
+    folded = np.mod(proposal.draw(walkers, random) - lower, 2 * width)
+    begun = lower + np.minimum(folded, 2 * width - folded)
+    state = emcee.State(begun, random_state=random.get_state())
     for _ in range(EXTENSIONS):
         for latest in sampler.sample(state, iterations=steps):
             if stopped():
                 raise CancelledError
             state = latest
         samples, values = _after_burn_in(sampler)
-        verdict = _diagnose(samples)
-        if verdict.converged:
+        numbers, complaints = _diagnose(samples)
+        if not complaints:
             break
     if normal:  # what is kept is the likelihood
         thetas = np.tile(fit.theta, (values.size, 1))
@@ -186,21 +187,17 @@ def sample_posterior(
         values = values - prior.log_density(thetas, parameters).reshape(values.shape)
     for column, i in enumerate(index):
         samples[..., column] = parameters[i].reported(samples[..., column])
+    bound = posterior_bound(likelihood, fit.theta, index, prior)[physical] if normal else None
     # the level of the light, where it is free, says nothing of the particle: it is integrated over
     return PosteriorResult(
         names=tuple(np.array(names)[physical].tolist()),
         samples=samples[..., physical],
         log_likelihood=values,
-        tau=verdict.tau[physical],
-        r_hat=verdict.r_hat[physical],
-        ess_bulk=verdict.ess_bulk[physical],
-        ess_tail=verdict.ess_tail[physical],
+        **{name: values[physical] for name, values in numbers.items()},
         acceptance=float(np.mean(sampler.acceptance_fraction)),
-        converged=verdict.converged,
-        message=verdict.message,
-        van_trees=posterior_bound(likelihood, fit.theta, index, prior)[physical]
-        if normal
-        else None,
+        converged=not complaints,
+        message="; ".join(complaints) or "τ, split R̂ and effective sample sizes are good",
+        van_trees=bound,
     )
 
 
@@ -241,28 +238,23 @@ class _Proposal:
                 centres.append(theta[index])
                 gaps.append(other.log_likelihood_gap)
         weights = -np.minimum(gaps, 3.0)
-        narrow = (
-            factor @ factor.T / _PROPOSAL_SCALE**2
-        )  # the covariance, and the way towards the prior
-        return cls(
-            np.array([centre + narrow @ known @ (wanted - centre) for centre in centres]),
-            weights - np.logaddexp.reduce(weights),
-            factor,
-            np.linalg.inv(factor),
-        )
+        narrow = factor @ factor.T / _PROPOSAL_SCALE**2  # the covariance
+        towards = [centre + narrow @ known @ (wanted - centre) for centre in centres]
+        weights = weights - np.logaddexp.reduce(weights)
+        return cls(np.array(towards), weights, factor, np.linalg.inv(factor))
 
     def draw(self, count: int, random: np.random.RandomState) -> FloatArray:
         """Draw points, shape (count, d)."""
         modes = random.choice(len(self.centres), size=count, p=np.exp(self.log_weights))
-        normal = random.standard_normal((count, self.factor.shape[0]))
+        normal = random.standard_normal((count, len(self.factor)))
         stretch = np.sqrt(_STUDENT_DOF / random.chisquare(_STUDENT_DOF, count))
         return self.centres[modes] + stretch[:, None] * (normal @ self.factor.T)
 
     def log_density(self, points: FloatArray) -> FloatArray:
         """Log density of points, shape (n,)."""
-        d = self.factor.shape[0]
-        apart = (points[None] - self.centres[:, None]).reshape(-1, d)
-        squares = np.sum((apart @ self.whiten.T) ** 2, axis=1).reshape(len(self.centres), -1)
+        d = len(self.factor)
+        apart = (points - self.centres[:, None]) @ self.whiten.T
+        squares = np.sum(apart**2, axis=2)
         norm = gammaln((_STUDENT_DOF + d) / 2) - gammaln(_STUDENT_DOF / 2)
         log_t = norm - 0.5 * (_STUDENT_DOF + d) * np.log1p(squares / _STUDENT_DOF)
         density: FloatArray = np.logaddexp.reduce(log_t + self.log_weights[:, None], axis=0)
@@ -276,30 +268,6 @@ class _Proposal:
         return fresh, self.log_density(points) - self.log_density(fresh)
 
 
-@dataclass(frozen=True)
-class _Verdict:
-    tau: FloatArray
-    r_hat: FloatArray
-    ess_bulk: FloatArray
-    ess_tail: FloatArray
-    converged: bool
-    message: str
-
-
-def _scatter(
-    proposal: _Proposal,
-    walkers: int,
-    lower: FloatArray,
-    upper: FloatArray,
-    random: np.random.RandomState,
-) -> FloatArray:
-    """Place the walkers: draws of the proposal, reflected into the box."""
-    points = proposal.draw(walkers, random)
-    width = upper - lower
-    folded = np.mod(points - lower, 2 * width)
-    return lower + np.minimum(folded, 2 * width - folded)
-
-
 def _after_burn_in(sampler: emcee.EnsembleSampler) -> tuple[FloatArray, FloatArray]:
     """Cut off the burn-in: samples (chain, draw, parameter), log-likelihoods (chain, draw)."""
     tau = float(np.max(sampler.get_autocorr_time(tol=0, quiet=True)))
@@ -309,7 +277,8 @@ def _after_burn_in(sampler: emcee.EnsembleSampler) -> tuple[FloatArray, FloatArr
     return np.array(samples), np.array(sampler.get_log_prob(discard=burn_in).T)
 
 
-def _diagnose(samples: FloatArray) -> _Verdict:
+def _diagnose(samples: FloatArray) -> tuple[dict[str, FloatArray], list[str]]:
+    """Give autocorrelation times, R̂ and effective sample sizes, and what is wrong with them."""
     import emcee
     from arviz_stats.base import array_stats  # takes a second, and only chains need it
 
@@ -329,5 +298,4 @@ def _diagnose(samples: FloatArray) -> _Verdict:
         complaints.append(
             f"effective sample size {min(bulk.min(), tail.min()):.0f} is not above {MIN_ESS:.0f}"
         )
-    message = "; ".join(complaints) or "τ, split R̂ and effective sample sizes are good"
-    return _Verdict(tau, r_hat, bulk, tail, not complaints, message)
+    return {"tau": tau, "r_hat": r_hat, "ess_bulk": bulk, "ess_tail": tail}, complaints

@@ -69,12 +69,9 @@ def companions(u: float, ring: FloatArray, cell: float) -> float:
     near = ring[ring < 0]
     spread = np.sqrt(1 - near**2)
 
-    def density(h: FloatArray) -> FloatArray:
-        out: FloatArray = h * np.exp(-(h**2) / 2)
-        return out
-
-    more = density((u + near * (u + 1 / u)) / spread) - density(u / spread)
-    return float(cell / (2 * math.pi) ** 1.5 * np.sum(more))
+    levels = np.array([u + near * (u + 1 / u), np.full(near.shape, u)]) / spread
+    there, elsewhere = np.sum(levels * np.exp(-(levels**2) / 2), axis=1)
+    return float(cell / (2 * math.pi) ** 1.5 * (there - elsewhere))
 
 
 @dataclass(frozen=True)
@@ -110,15 +107,3 @@ class Excursions:
         steps = range(math.ceil((high - low) / _LEVEL_TOLERANCE))
         few = bisect_left(steps, True, key=lambda k: excess(low + k * _LEVEL_TOLERANCE) <= 0)
         return low + few * _LEVEL_TOLERANCE
-
-
-def height_reached(
-    alarms: float,
-    area: float,
-    volume: float = 0.0,
-    *,
-    correlation: float = 0.0,
-    lowest: float = LOWEST,
-) -> float:
-    """Find the level above which noise has a given expected number of maxima."""
-    return Excursions(area, volume, correlation).level(alarms, lowest=lowest)

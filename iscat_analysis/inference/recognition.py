@@ -13,11 +13,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
-from iscat_analysis.inference.fit import AMPLITUDE, POOR_FIT_P, fit_particle, search_box
+from iscat_analysis.inference.fit import (
+    AMPLITUDE,
+    POOR_FIT_P,
+    candidate_at,
+    fit_particle,
+    search_box,
+)
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.maximiser import Optimum, covariance_of
 from iscat_analysis.inference.models import SphereOfIndex, SphereOfLight
@@ -29,15 +36,7 @@ from iscat_analysis.inference.sizes import (
     scanned_masses,
 )
 from iscat_analysis.optics.sized import SeatedModel, largest_dipole_nm
-from iscat_analysis.records import (
-    Alternative,
-    Box,
-    Candidate,
-    FitResult,
-    FloatArray,
-    Status,
-    verdict,
-)
+from iscat_analysis.records import Alternative, Box, FitResult, FloatArray, Status, verdict
 from iscat_analysis.units import sphere_diameter_nm
 
 _STRENGTHS = np.geomspace(0.007, 0.25, 10)  # light per volume of a sphere whose index is fitted
@@ -104,12 +103,12 @@ def recognised(
         return None
     found.sort(key=lambda one: -one.criterion)
     best = found[0]
-    sphere = fit_seated(best.likelihood, best.optimum.theta, level=level)
-    excess, left = (max(one[1].chi2_reduced - 1, 0.0) for one in ((likelihood, fit), sphere))
+    seated, again = fit_seated(best.likelihood, best.optimum.theta, level=level)
+    excess, left = (max(one.chi2_reduced - 1, 0.0) for one in (fit, again))
     # Share of the dipole's excess of χ² that a sphere may have if it does not describe all
-    if sphere[1].p_value < POOR_FIT_P and left > 0.1 * excess:
+    if again.p_value < POOR_FIT_P and left > 0.1 * excess:
         return None
-    start = Candidate(*_place(likelihood, begin), float(begin[2]), fit.mass_kda, fit.snr)
+    start = candidate_at(likelihood, begin, fit.snr)
     lifted = fit_particle(replace(likelihood, prior=None), start, "joint", z_range_nm, level=level)
     if lifted.log_likelihood - each > best.criterion:
         return None
@@ -118,13 +117,13 @@ def recognised(
         for other in found[1:]
         if not best.is_like(other)
     )
-    flags = list(sphere[1].flags)
+    flags = list(again.flags)
     if others and others[0].log_likelihood_gap < math.log(AMBIGUITY_ODDS):
         flags.append(Status.AMBIGUOUS_SIZE)
     status, noticed = verdict(flags)
     shift = fit.x_nm - float(fit.estimate[0]), fit.y_nm - float(fit.estimate[1])
-    whole = replace(sphere[1], alternatives=others, status=status, flags=noticed)
-    return sphere[0], whole.shifted(*shift)
+    whole = replace(again, alternatives=others, status=status, flags=noticed)
+    return seated, whole.shifted(*shift)
 
 
 def refitted(
@@ -147,8 +146,8 @@ def fit_seated(
     if model_of(seated).fits_index:
         found = _with_index(seated, theta, -math.inf, level=level)
         seated, theta, information = found.likelihood, found.optimum.theta, found.information
-    start = Candidate(*_place(seated, theta), float(theta[2]), float(theta[AMPLITUDE]), 0.0)
-    fit = fit_particle(seated, start, "mass", seated.model.z_range_nm, level=level)
+    start, heights = candidate_at(seated, theta), seated.model.z_range_nm
+    fit = fit_particle(seated, start, "mass", heights, level=level)
     flags = [*fit.flags, Status.LARGE]
     if information is not None:  # which depends on the error of the index as well
         free = np.insert(fit.box.free, LEVEL, True)
@@ -167,12 +166,6 @@ def model_of(seated: Likelihood) -> SeatedModel:
     if not isinstance(seated.model, SeatedModel):
         raise TypeError(f"{type(seated.model).__name__} is no SeatedModel")
     return seated.model
-
-
-def _place(likelihood: Likelihood, theta: FloatArray) -> tuple[float, float]:
-    """Give the place of θ [pixels]."""
-    pixel = likelihood.grid.pixel_nm
-    return float(theta[0]) / pixel, float(theta[1]) / pixel
 
 
 def _centred(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
@@ -199,14 +192,9 @@ def _centred(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
 
 def _is_in_reach(likelihood: Likelihood, theta: FloatArray) -> bool:
     """Tell whether the model is known for all places that a fit from a start may reach."""
-    start = Candidate(*_place(likelihood, theta), float(theta[2]), 1.0, 0.0)
-    box = search_box(likelihood, start, "mass", likelihood.model.z_range_nm)
-    half = likelihood.grid.pixel_nm / 2
-    far = (
-        max(box.upper[k] - axis[0], axis[-1] - box.lower[k]) + half
-        for k, axis in enumerate((likelihood.grid.x_nm, likelihood.grid.y_nm))
-    )
-    return math.hypot(*far) <= likelihood.model.reach_nm
+    box = search_box(likelihood, theta, "mass", likelihood.model.z_range_nm)
+    corners = product(*zip(box.lower[:2], box.upper[:2], strict=True))
+    return bool(likelihood.supports(np.array([[*at, *theta[2:]] for at in corners])).all())
 
 
 def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool) -> list[_Sphere]:
@@ -236,34 +224,27 @@ def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool)
             there = replace(seated, model=model.of_strength(float(strengths[j])))
             found = _with_index(there, begin, least, level=level)
         else:
-            box = _box(seated, begin, level=level)
-            begin = np.clip(begin, box.lower, box.upper)
-            end = seated.maximize(begin, box.free, box.lower, box.upper, least=least)
+            box = search_box(seated, begin, "mass", model.z_range_nm, level=level)
+            end = seated.maximize(np.clip(begin, box.lower, box.upper), box, least=least)
             found = _Sphere(seated, end, end.fisher)
         if found.optimum.converged and found.optimum.log_likelihood > least:
             optima.append(found)
     return optima
 
 
-def _box(seated: Likelihood, theta: FloatArray, *, level: bool) -> Box:
-    start = Candidate(*_place(seated, theta), float(theta[2]), float(theta[AMPLITUDE]), 0.0)
-    return search_box(seated, start, "mass", seated.model.z_range_nm, level=level)
-
-
 def _with_index(seated: Likelihood, theta: FloatArray, least: float, *, level: bool) -> _Sphere:
     """Maximise over the index too."""
-    model, box = model_of(seated), _box(seated, theta, level=level)
+    model = model_of(seated)
+    box = search_box(seated, theta, "mass", model.z_range_nm, level=level)
     spheres = SphereOfLight(model)
     light = float(theta[AMPLITUDE]) * model.strength_of(model.sphere.index.real)
-    lower, upper = np.insert(box.lower, LEVEL, 0.0), np.insert(box.upper, LEVEL, np.inf)
-    end = seated.under(spheres).maximize(
-        np.clip(np.insert(theta, LEVEL, light), lower, upper),
-        np.insert(box.free, LEVEL, True), lower, upper, least=least,
-    )  # fmt: skip
+    wider = zip((box.free, box.lower, box.upper), (True, 0.0, np.inf), strict=True)
+    box = Box(*(np.insert(each, LEVEL, of_light) for each, of_light in wider))
+    begin = np.clip(np.insert(theta, LEVEL, light), box.lower, box.upper)
+    end = seated.under(spheres).maximize(begin, box, least=least)
     found = spheres.with_index(end.theta)
-    information = seated.under(SphereOfIndex(model)).score_fisher(np.append(found, end.theta[-1]))[
-        2
-    ]
+    of_index = seated.under(SphereOfIndex(model))
+    information = of_index.score_fisher(np.append(found, end.theta[-1]))[2]
     own = np.delete(np.arange(6), LEVEL)
     return _Sphere(
         replace(seated, model=model.of_index(float(found[LEVEL]))),

@@ -27,15 +27,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct
 from scipy.special import ndtri, stdtr, stdtrit
 
-from iscat_analysis._kernels.noise import FLOOR
 from iscat_analysis._kernels.sliding import frame_scores
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
+from iscat_analysis.inference.maximiser import covariance_of
 from iscat_analysis.records import BoolArray, FloatArray
 
 PARTS = 8
@@ -90,17 +91,14 @@ def response_of(
     level = float(theta[LEVEL])
     used = likelihood.used
     data = np.where(used, likelihood.data, 0.0)
-    ratio = None if likelihood.model.rho > 0 else power_ratio
-    before, after = likelihood.noise.count_response(data, signal, math.exp(level), before_e, ratio)
+    before, after = likelihood.noise.count_response(data, signal, math.exp(level), before_e)
+    if not likelihood.model.rho > 0:  # the signal is no share of the background
+        before = -power_ratio * after
     terms = likelihood.noise.terms(data, signal, level)
     index = np.flatnonzero(free)
     slope = np.where(used, np.concatenate([first, terms.by_level[None]])[index], 0.0)
     fisher = np.einsum("iyx,jyx,yx->ij", slope, slope, terms.information)
-    unit = 1 / np.sqrt(np.maximum(np.diag(fisher), FLOOR))
-    try:
-        inverse = np.linalg.inv(fisher * np.outer(unit, unit)) * np.outer(unit, unit)
-    except np.linalg.LinAlgError:
-        return None
+    inverse = covariance_of(fisher, np.ones(index.size, dtype=bool))
     particle = np.flatnonzero(index < LEVEL)
     variance = np.diag(inverse)[particle]
     if not np.all(np.isfinite(variance) & (variance > 0)):
@@ -124,19 +122,14 @@ def series_of(
     Shapes: `counts` (t, ny, nx), `weights` (n, ny, nx), `power` (t,), `gain, offset` (ny, nx),
     `mean_e` (ny, nx), `read_variance_e2` (ny, nx).
     """
-    lit = power > 0
-    flat = weights.reshape(len(weights), -1)
+    lit, number = power > 0, len(weights)
     seen = weights * gain
-    values = np.empty((len(weights), np.count_nonzero(lit)))
-    frame_scores(counts.reshape(len(counts), mean_e.size), lit, seen.reshape(flat.shape), values)
+    values = np.empty((number, np.count_nonzero(lit)))
+    frame_scores(counts.reshape(len(counts), -1), lit, seen.reshape(number, -1), values)
     values -= np.sum(seen * offset, axis=(1, 2))[:, None]
-    squared = flat**2
-    return Series(
-        values,
-        power[lit],
-        squared @ np.maximum(mean_e, 0.0).ravel(),
-        squared @ read_variance_e2.ravel(),
-    )
+    squared = weights.reshape(number, -1) ** 2
+    shot, read = (squared @ e.ravel() for e in (np.maximum(mean_e, 0.0), read_variance_e2))
+    return Series(values, power[lit], shot, read)
 
 
 def repeats_of(windows: tuple[Series, ...], longer: tuple[Series, ...] | None = None) -> FloatArray:
@@ -196,7 +189,7 @@ def _spectrum(series: Series) -> FloatArray:
     power = series.power
     if power.size < 2:
         return out
-    light = series.shot[:, None] * power + series.read[:, None] * np.ones(power.size)
+    light = series.shot[:, None] * power + series.read[:, None]
     weight = power**2 / light
     value = series.values / power
     mean = np.sum(weight * value, axis=1) / np.sum(weight, axis=1)
@@ -290,16 +283,12 @@ def pooled(
 
     Shapes: `own` (events, 1 + len(LENGTHS), `empty, empty_counts` (contrasts, tiles).
     """
-    own = own[own[:, 0, 1] > 0]
-    if not len(own):
+    own, tiles = own[own[:, 0, 1] > 0], _Tiles.of(empty, empty_counts, shared)
+    if not len(own) or (distances is not None and tiles is None):
         return None
-    tiles = _Tiles.of(empty, empty_counts, shared)
-    if distances is None:
-        found = _of_windows(own, tiles)
-    elif tiles is not None:
+    found = _of_windows(own, tiles)
+    if distances is not None and tiles is not None:
         found = _of_frames(tiles, distances)
-    else:
-        return None
     ratio2 = max(found.ratio2, 1e-6)
     error = math.sqrt(found.variance) / (2 * ratio2)  # of ln ratio
     ratio, degrees = math.sqrt(ratio2), max(found.degrees, 2)
@@ -317,15 +306,14 @@ def pooled(
         frames=found.frames,
         by_frames=tuple(math.sqrt(value) for value, _ in found.curve),
         by_frames_se=tuple(
-            math.sqrt(spread) / (2 * math.sqrt(max(value, 1e-12))) for value, spread in found.curve
+            math.sqrt(variance / max(value, 1e-12)) / 2 for value, variance in found.curve
         ),
         empty=found.levels,
         single=distances is not None,
     )
 
 
-@dataclass(frozen=True)
-class _Found:
+class _Found(NamedTuple):
     """Squared ratio, its variance and degrees of freedom, and the same against frames."""
 
     ratio2: float

@@ -36,20 +36,31 @@ OTHER_SIZE_SHARE = 0.02
 """Share of the mass by which two maxima at one height differ at least."""
 
 
-def size_starts(
-    likelihood: Likelihood, model: SizedModel, theta: FloatArray, box: Box
-) -> list[FloatArray]:
-    """Local maxima of the likelihood over diameter and height, best first."""
-    masses = scanned_masses(model, float(box.lower[3]), float(box.upper[3]))
-    heights = scanned_heights(model, float(box.lower[2]), float(box.upper[2]))
-    values = scan_sizes(likelihood, model, theta, masses, heights)
+def starts_of(
+    likelihood: Likelihood, theta: FloatArray, box: Box
+) -> list[tuple[FloatArray, float]]:
+    """Local maxima of the likelihood over heights, and over diameters of a sphere, best first.
+
+    Each start is θ with the height and the amplitude of a maximum; beside it the log-likelihood.
+    """
+    model, (low, high) = likelihood.model, (float(end[2]) for end in (box.lower, box.upper))
+    heights = scanned_heights(model, low, high)
+    if isinstance(model, SizedModel) and box.free[3]:
+        masses = scanned_masses(model, float(box.lower[3]), float(box.upper[3]))
+        values = scan_sizes(likelihood, model, theta, masses, heights)
+        amplitudes = np.broadcast_to(masses[:, None], values.shape)
+        most = 6
+    else:
+        heights = np.unique([*heights, theta[2]])
+        bounds = (float(box.lower[3]), float(box.upper[3])) if box.free[3] else None
+        values, amplitudes = likelihood.scan_heights(heights, theta, bounds)
+        most = 8
     starts = []
-    # local maxima that are followed
-    for i, j in highest_maxima(values, 6, diagonal=True):
+    for at in highest_maxima(values, most, diagonal=True):
         begin = theta.copy()
-        begin[2], begin[3] = heights[j], masses[i]
-        starts.append(begin)
-    return starts or [theta.copy()]
+        begin[2], begin[3] = heights[at[-1]], amplitudes[at]
+        starts.append((begin, float(values[at])))
+    return starts
 
 
 def highest_maxima(

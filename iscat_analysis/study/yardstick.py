@@ -391,7 +391,7 @@ def _one(
     theta = np.array([x, y, z, model.scale.amplitude(mass), 0.0])
     read = config.camera.assumed.read_noise_e
     likelihood = expected_likelihood(
-        model, grid, theta, background, per_frame, n_before=n_before, n_after=n_after,
+        model, grid, theta, (background, per_frame), (n_before, n_after),
         read_noise_e=0.0 if isinstance(read, str) else read,
     )  # fmt: skip
     collected = n_after * per_frame * collected_area_nm2(model, z, mass) / grid.pixel_nm**2

@@ -22,14 +22,8 @@ import pandas as pd
 from iscat_analysis.config import INVISIBLE, Config
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event
-from iscat_analysis.inference.common_size import (
-    UNDETERMINED,
-    CommonSize,
-    common_sizes,
-    fit_common_size,
-)
+from iscat_analysis.inference.common_size import UNDETERMINED, CommonSize, SphereFrames
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.model import blurred, path_variance_nm2
 from iscat_analysis.optics.sized import LARGEST_INDEX, LEAST_CONTRAST, SizedModel
 from iscat_analysis.records import FloatArray, Status, verdict
@@ -76,12 +70,9 @@ def sphere_track(
     d_um2_s, sigma_d = _diffusion(context, used)
     variance = path_variance_nm2(d_um2_s, exposure_of(context.config)[1])
     averaged = blurred(model, variance, upwards=True)
-    sizes = common_sizes(
-        [replace(event.likelihood, model=averaged) for event in used],
-        averaged,
-        np.array([event.place[:3] for event in used]),
-        context.config.fit.z_range_nm,
-    )
+    likelihoods = [replace(event.likelihood, model=averaged) for event in used]
+    frames = SphereFrames(likelihoods, averaged, context.config.fit.z_range_nm)
+    sizes = frames.common_sizes(np.array([event.place[:3] for event in used]))
     if not sizes:
         return SphereTrack(averaged, [*events], [], np.zeros((0, 10)))
     near = replace(averaged, mass_range_kda=_range_around(averaged, sizes))
@@ -112,27 +103,19 @@ def sphere_track(
     # a single index describes a material whose index has an imaginary part of less than 1e-6
     if d_um2_s > 0 and abs(model.sphere.index.imag) < 1e-6 and sizes[0].converged:
         motion = _motion(context.config, d_um2_s, sigma_d, sizes[0])
-        likelihoods = [event.likelihood for event in used]
-        configured, homogeneous = (
-            explained(likelihoods, averaged, sizes, context.config.fit.z_range_nm, motion, free)
-            for free in (False, True)
-        )
+        frames = replace(frames, likelihoods=[event.likelihood for event in used])
+        configured, homogeneous = (explained(frames, sizes, motion, free) for free in (False, True))
     return SphereTrack(averaged, fitted, sizes, shifts, configured, homogeneous)
 
 
 def explained(
-    likelihoods: Sequence[Likelihood],
-    model: SizedModel,
-    sizes: Sequence[CommonSize],
-    z_range_nm: tuple[float, float],
-    motion: tuple[float, float],
-    free_index: bool,
+    frames: SphereFrames, sizes: Sequence[CommonSize], motion: tuple[float, float], free_index: bool
 ) -> CommonSize | None:
     """Fit images and motion with the configured particle, or a homogeneous sphere of any index.
 
     The fits begin at every likely diameter.
     """
-    found = []
+    found, model = [], frames.model
     for size in (one for one in sizes if one.converged):
         tried, index = model, None
         if free_index:
@@ -140,15 +123,8 @@ def explained(
             tried, index = replace(model, sphere=alike), alike.index.real
             if abs(index / model.optics.n_sample - 1) < INVISIBLE:  # a shell may undo its core
                 continue
-        one = fit_common_size(
-            likelihoods,
-            tried,
-            size.likely,
-            z_range_nm,
-            frames=size.frames,
-            mass_kda=size.mass_kda,
-            index=index,
-            motion=motion,
+        one = replace(frames, model=tried).fit(
+            size.likely, mass_kda=size.mass_kda, index=index, frames=size.frames, motion=motion
         )
         if one is not None and one.converged:
             found.append(one)

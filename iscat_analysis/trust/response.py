@@ -11,11 +11,12 @@ import pandas as pd
 import scipy
 from numpy.typing import NDArray
 
-from iscat_analysis.bounds import eliminated, imitation, joint_information, peak_gradient
+from iscat_analysis.bounds import joint_information, peak_gradient
 from iscat_analysis.config import ABERRATIONS, Config, Optics, OpticsCovariance
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import asimov_conditional, asimov_poisson
 from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.maximiser import eliminated, imitation
 from iscat_analysis.inference.models import SphereOfIndex
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model, peak_per_amplitude
 from iscat_analysis.optics.parameters import prior_of

@@ -13,11 +13,14 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference import counts as noise
 from iscat_analysis.inference.cause import Cause, likely_cause
 from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.records import Candidate
 
-SIDE = 32
-LIGHT = 2e7
+SIDE, LIGHT = 32, 2e7
+GRID = PixelGrid.region((0, SIDE), (0, SIDE), PIXEL_NM)
+PARTICLE = (5.0, 1000.0)
+"""Height and mass."""
 
 
 def _cause(
@@ -34,21 +37,23 @@ def _cause(
     `averaged` frames were made one before.
     """
     config, rng = make_config(optics={"focus_nm": focus_nm}), np.random.default_rng(4)
-    grid = PixelGrid.region((0, SIDE), (0, SIDE), PIXEL_NM)
     true = PixelGrid.region((0, SIDE), (0, SIDE), PIXEL_NM * stretch)
     other = forward_model(make_config(optics={"focus_nm": focus_nm} | seen), true.diagonal_nm)
-    model = forward_model(config, grid.diagonal_nm)
+    model = forward_model(config, GRID.diagonal_nm)
     fits = []
     for x, y in rng.uniform(15.0, 17.0, (count, 2)):
-        place = (x * true.pixel_nm, y * true.pixel_nm, 5.0, 1000.0)
-        after = LIGHT * (1 + other.image(true, *place))
-        light = averaged * np.array([np.full(grid.shape, LIGHT), after.T if turned else after])
+        after = LIGHT * (1 + other.image(true, x * true.pixel_nm, y * true.pixel_nm, *PARTICLE))
+        light = averaged * np.array([np.full(GRID.shape, LIGHT), after.T if turned else after])
         counts = rng.poisson(light) / averaged
-        likelihood = noise.conditional(model, grid, *counts, 1.0)
-        start = Candidate(y, x, 5.0, 1000.0, 10.0) if turned else Candidate(x, y, 5.0, 1000.0, 10.0)
-        fit = fit_particle(likelihood, start, "mass", (0, 1000), level=False)
-        fits.append((likelihood, fit.theta, fit.box.free))
+        likelihood = noise.conditional(model, GRID, *counts, 1.0)
+        fits.append(_fitted(likelihood, *((y, x) if turned else (x, y))))
     return likely_cause(config, fits)
+
+
+def _fitted(likelihood: Likelihood, x: float, y: float) -> tuple[Likelihood, Any, Any]:
+    start = Candidate(x, y, *PARTICLE, 10.0)
+    fit = fit_particle(likelihood, start, "mass", (0, 1000), level=False)
+    return likelihood, fit.theta, fit.box.free
 
 
 @pytest.mark.parametrize(
@@ -94,17 +99,14 @@ def _dark_cause(
     """Fit particles of another microscope in dark field."""
     dark = {"scheme": "darkfield"}
     config = make_config(calibrated=False, optics=dark | configured)
-    grid = PixelGrid.region((0, SIDE), (0, SIDE), PIXEL_NM)
-    model = forward_model(config, grid.diagonal_nm)
-    other = forward_model(make_config(calibrated=False, optics=dark | seen), grid.diagonal_nm)
-    level, rng = np.full(grid.shape, 2e4), np.random.default_rng(5)
+    model = forward_model(config, GRID.diagonal_nm)
+    other = forward_model(make_config(calibrated=False, optics=dark | seen), GRID.diagonal_nm)
+    level, rng = np.full(GRID.shape, 2e4), np.random.default_rng(5)
     fits = []
     for x, y in rng.uniform(15.0, 17.0, (4, 2)):
-        light = level + scale * other.image(grid, x * PIXEL_NM, y * PIXEL_NM, 5.0, 1000.0)
-        likelihood = noise.poisson(model, grid, rng.poisson(light).astype(float), level, scale)
-        start = Candidate(x, y, 5.0, 1000.0, 10.0)
-        fit = fit_particle(likelihood, start, "mass", (0, 1000), level=False)
-        fits.append((likelihood, fit.theta, fit.box.free))
+        light = level + scale * other.image(GRID, x * PIXEL_NM, y * PIXEL_NM, *PARTICLE)
+        counts = rng.poisson(light).astype(float)
+        fits.append(_fitted(noise.poisson(model, GRID, counts, level, scale), x, y))
     return likely_cause(config, fits)
 
 

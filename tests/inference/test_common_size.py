@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
-from iscat_analysis.inference.common_size import CommonSize, common_sizes, fit_common_size
+from iscat_analysis.inference.common_size import SphereFrames
 from iscat_analysis.inference.counts import KNOWN, counts_likelihood
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.laws import Poisson
@@ -57,7 +57,7 @@ def frames_of(
         likelihoods.append(
             counts_likelihood(
                 model, GRID, flat, counts, 1.0, background=KNOWN, noise=Poisson(), scale_e=None,
-                others=None, read_variance_before_e2=nothing, read_variance_after_e2=nothing,
+                others=None, read_variances_e2=(nothing, nothing),
                 masked=np.zeros(GRID.shape, dtype=bool),
             )
         )  # fmt: skip
@@ -74,7 +74,7 @@ def test_frames_have_one_diameter_and_places_of_their_own() -> None:
     rng = np.random.default_rng(1)
     model = model_of(120.0)
     likelihoods, places = frames_of(model, 4, 3000.0, rng)
-    found = common_sizes(likelihoods, model, near(places, rng), Z_RANGE_NM)
+    found = SphereFrames(likelihoods, model, Z_RANGE_NM).common_sizes(near(places, rng))
     best = found[0]
     assert best.converged
     whole = np.zeros((13, 13))
@@ -100,7 +100,7 @@ def test_index_and_diameter_need_the_motion_of_a_small_sphere() -> None:
     likelihoods, places = frames_of(model, 5, 5000.0, rng)
     motion = 1 / 80.0, 0.02 / 80.0
     start = {"mass_kda": 1.1 * model.material.mass_kda, "index": 1.44}
-    joint = fit_common_size(likelihoods, model, places, Z_RANGE_NM, **start, motion=motion)
+    joint = SphereFrames(likelihoods, model, Z_RANGE_NM).fit(places, **start, motion=motion)
     assert joint is not None
     assert joint.converged
     sigma = math.sqrt(joint.covariance()[1, 1])
@@ -119,10 +119,9 @@ def log_odds(model: SizedModel, true: SizedModel, light_e: float, seed: int) -> 
     diameter = true.sphere.diameter_nm
     motion = rng.normal(1.0, 0.15) / diameter, 0.15 / diameter
     likelihoods = [replace(one, model=model) for one in likelihoods]
-    sizes = common_sizes(likelihoods, model, near(places, rng), Z_RANGE_NM)
-    both = [
-        explained(likelihoods, model, sizes, Z_RANGE_NM, motion, free) for free in (False, True)
-    ]
+    frames = SphereFrames(likelihoods, model, Z_RANGE_NM)
+    sizes = frames.common_sizes(near(places, rng))
+    both = [explained(frames, sizes, motion, free) for free in (False, True)]
     track = SphereTrack(model, [], sizes, np.zeros((10, 10)), *both)
     return float(table_of_sizes({0: track}, None)["log_odds_particle"].iloc[0])
 
@@ -179,7 +178,8 @@ def test_pulls_of_faint_tracks(kind: str, diameter: float, light_e: float, share
     raw, pulls = np.empty((2, trials))
     for k in range(trials):
         likelihoods, places = frames_of(model, 20, light_e, rng)
-        best: CommonSize = common_sizes(likelihoods, model, near(places, rng), Z_RANGE_NM)[0]
+        frames = SphereFrames(likelihoods, model, Z_RANGE_NM)
+        best = frames.common_sizes(near(places, rng))[0]
         sigma = math.sqrt(best.covariance()[0, 0])
         raw[k] = (best.mass_kda - model.material.mass_kda) / sigma
         pulls[k] = raw[k] - best.bias[0] / sigma
@@ -201,7 +201,7 @@ def test_frames_that_leave_several_heights_do_not_choose_another_diameter(share:
     model = replace(model, mass_range_kda=(model.sphere.mass_kda / 8, model.sphere.mass_kda * 8))
     for _ in range(max(4, round(16 * share))):
         likelihoods, places = frames_of(model, 12, 2000.0, rng)
-        best = common_sizes(likelihoods, model, near(places, rng), Z_RANGE_NM)[0]
+        best = SphereFrames(likelihoods, model, Z_RANGE_NM).common_sizes(near(places, rng))[0]
         assert len(best.frames) > 12
         diameter = model.sphere.of_mass(best.mass_kda).diameter_nm
         assert abs(diameter - 200.0) < 15.0
@@ -222,8 +222,8 @@ def test_the_posterior_visits_every_diameter() -> None:
     flat, nothing = np.full(grid.shape, 15.0), np.zeros(grid.shape)
     likelihood = counts_likelihood(
         model, grid, flat, rng.poisson(15.0 * (1 + signal)).astype(float), 1.0, background=KNOWN,
-        noise=Poisson(), scale_e=None, others=None, read_variance_before_e2=nothing,
-        read_variance_after_e2=nothing, masked=np.zeros(grid.shape, dtype=bool),
+        noise=Poisson(), scale_e=None, others=None, read_variances_e2=(nothing, nothing),
+        masked=np.zeros(grid.shape, dtype=bool),
     )  # fmt: skip
     start = Candidate(0.1, -0.2, 60.0, model.material.mass_kda, 10.0)
     fit = fit_particle(likelihood, start, "size", (0.0, 250.0), level=False)

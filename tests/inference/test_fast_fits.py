@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scenes import PIXEL_NM, gold, make_config
+from scenes import PIXEL_NM, gold, make_config, observed_information
 
 from iscat_analysis._kernels.hessian import PAIRS, first_order_bias
 from iscat_analysis._kernels.image import signal_gradient, signal_image
@@ -24,13 +24,14 @@ from iscat_analysis.inference.fit import (
     gamma_above,
     precision,
     search_box,
+    start_theta,
     three_tests,
 )
 from iscat_analysis.inference.laws import CONDITIONAL
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.maximiser import Optimum
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.records import BoolArray, Candidate, FloatArray
+from iscat_analysis.records import PARAMETERS, BoolArray, Box, Candidate, FitResult, FloatArray
 
 GRID = PixelGrid.region((0, 14), (0, 13), PIXEL_NM)
 SETTLED = 0.02  # σ: how far apart two fits of one optimum may end
@@ -63,7 +64,7 @@ def _case(kind: str, *, light: float = 3e3, pupil: str = "round", seed: int = 4)
     if kind == "conditional":
         before, after = rng.poisson(light, GRID.shape), rng.poisson(1.02 * light * (1 + signal))
         likelihood = noise.conditional(
-            model, GRID, before, after, 1.0, read_variance_after_e2=50.0, masked=masked
+            model, GRID, before, after, 1.0, read_variances_e2=(0.0, 50.0), masked=masked
         )
     else:
         scale = light if model.rho else 30 / signal.max()
@@ -160,7 +161,7 @@ def test_errors_are_those_of_the_observed_information(case: Case, free: tuple[bo
         which, theta, fisher, free_array, derivatives, slope=slope
     )
     assert known
-    observed = which.observed_information(theta)[np.ix_(free_array, free_array)]
+    observed = observed_information(which, theta)[np.ix_(free_array, free_array)]
     unit = np.array([1, 1, 1, slope])[free_array[:4]]
     dense = np.linalg.inv(observed)[: unit.size, : unit.size] * np.outer(unit, unit)
     errors = np.sqrt(dense.diagonal())
@@ -264,12 +265,12 @@ def _every_start(
     which: Likelihood, start: Candidate, z_range: tuple[float, float]
 ) -> list[Optimum]:
     """Follow a start at every height of a fine grid to its end; best first."""
-    box = search_box(which, start, "joint", z_range)
+    box = search_box(which, start_theta(which, start), "joint", z_range)
     found = []
     for z in np.arange(z_range[0], z_range[1], 15.0):
         theta = np.array([start.x_px * PIXEL_NM, start.y_px * PIXEL_NM, z, 1.0, 0.0])
         theta[3] = which.model.scale.amplitude(start.mass_kda)
-        found.append(which.maximize(theta, box.free, box.lower, box.upper))
+        found.append(which.maximize(theta, box))
     return sorted((o for o in found if o.converged), key=lambda o: -o.log_likelihood)
 
 
@@ -306,6 +307,14 @@ def test_starts_that_are_given_up_change_nothing(mass: float, seed: int) -> None
             assert any(abs(z - n) < 2.0 for n in near), (z, gap)
 
 
+def _with_every_start(which: Likelihood, start: Candidate, *, level: bool) -> FitResult:
+    """Fit a particle where nothing is given up, and the given height is followed too."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("iscat_analysis.inference.fit.FOLLOWED", math.inf)
+        patched.setattr("iscat_analysis.inference.fit.PLAIN", math.inf)
+        return fit_particle(which, start, "joint", (0.0, 600.0), level=level)
+
+
 @pytest.mark.parametrize("seed", [308, 13, 4, 6])
 def test_a_bad_start_costs_no_optimum(seed: int) -> None:
     """Gold, a pixel and half of the mass off, at times beside a particle nobody knows of."""
@@ -316,20 +325,14 @@ def test_a_bad_start_costs_no_optimum(seed: int) -> None:
     z, (x, y) = rng.uniform(0, 600), 10 + rng.uniform(-3, 3, 2)
     signal = model.image(grid, x * PIXEL_NM, y * PIXEL_NM, z, mass)
     if seed % 2:
-        beside = np.array([x, y]) + rng.uniform(-5, 5, 2)
-        signal = signal + model.image(
-            grid, *(beside * PIXEL_NM), rng.uniform(0, 600), mass * rng.uniform(0.3, 1)
-        )
+        beside = (np.array([x, y]) + rng.uniform(-5, 5, 2)) * PIXEL_NM
+        signal += model.image(grid, *beside, rng.uniform(0, 600), mass * rng.uniform(0.3, 1))
     light = 3000.0 * np.array([np.ones(grid.shape), 1 + np.maximum(signal, -0.9)])
     which = noise.conditional(model, grid, *rng.poisson(light), 1.0)
-    start = Candidate(
-        x + rng.normal(0, 1), y + rng.normal(0, 1), 300.0, mass * math.exp(rng.normal(0, 0.5)), 10.0
-    )
+    place, heavier = (x + rng.normal(0, 1), y + rng.normal(0, 1)), math.exp(rng.normal(0, 0.5))
+    start = Candidate(*place, 300.0, mass * heavier, 10.0)
     fit = fit_particle(which, start, "joint", (0.0, 600.0), level=True)
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("iscat_analysis.inference.fit.FOLLOWED", math.inf)
-        patched.setattr("iscat_analysis.inference.fit.PLAIN", math.inf)
-        slow = fit_particle(which, start, "joint", (0.0, 600.0), level=True)
+    slow = _with_every_start(which, start, level=True)
     assert fit.log_likelihood == pytest.approx(slow.log_likelihood, abs=0.1)
     assert fit.status == slow.status
 
@@ -346,13 +349,10 @@ def test_a_plain_particle_is_found_without_the_given_height(pupil: str, level: b
         mass = amplitude * rng.uniform(0.5, 1.5)
         start = Candidate(*place, float(rng.uniform(0, 600)), float(mass), 10.0)
         fit = fit_particle(case.likelihood, start, "joint", (0.0, 600.0), level=level)
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setattr("iscat_analysis.inference.fit.PLAIN", math.inf)
-            slow = fit_particle(case.likelihood, start, "joint", (0.0, 600.0), level=level)
+        slow = _with_every_start(case.likelihood, start, level=level)
         assert fit.log_likelihood > PLAIN
         known = np.isfinite(fit.sigma)
-        names = ("x_nm", "y_nm", "z_nm", "mass_kda")
-        moved = np.array([getattr(fit, name) - getattr(slow, name) for name in names])
+        moved = np.array([getattr(fit, name) - getattr(slow, name) for name in PARAMETERS])
         assert np.all(np.abs(moved[known]) < SETTLED * fit.sigma[known])
         assert (fit.status, fit.flags) == (slow.status, slow.flags)
 
@@ -396,13 +396,14 @@ def test_a_picture_gives_the_fit_of_the_field(
         else noise.poisson(model, grid, after, 1e3, scale)
     )
     start = Candidate(9.6, 9.8, model.height_nm, 800.0, 10.0)
-    box = search_box(which, start, "mass", (0.0, 600.0), level=level)
+    begin = start_theta(which, start)
+    box = search_box(which, begin, "mass", (0.0, 600.0), level=level)
     assert which.is_pictured(model.height_nm, box.lower, box.upper)
     fast = fit_particle(which, start, "mass", (0.0, 600.0), level=level)
-    tight = which.maximize(fast.theta, box.free, box.lower, box.upper, tolerance=1e-10)
+    tight = which.maximize(fast.theta, box, tolerance=1e-10)
     _through_the_field(monkeypatch)
     slow = fit_particle(which, start, "mass", (0.0, 600.0), level=level)
-    same = which.maximize(fast.theta, box.free, box.lower, box.upper, tolerance=1e-10)
+    same = which.maximize(fast.theta, box, tolerance=1e-10)
     known = [0, 1, 3]
     units = 1 / np.sqrt(np.diag(same.fisher))
     assert np.all(np.abs(tight.theta - same.theta)[box.free] < 1e-3 * units[box.free])
@@ -485,7 +486,7 @@ def test_a_place_that_is_held_may_lie_outside_the_bounds(place: float) -> None:
     end = 100 * abs(amplitude)
     lower, upper = np.array([0.0, 0.0, 0.0, -end, 0.0]), np.array([1200.0, 1200.0, 500.0, end, 0.0])
     free = np.array([False, False, False, True, False])
-    found = which.maximize(start, free, lower, upper, passes=1)
+    found = which.maximize(start, Box(free, lower, upper), passes=1)
     assert found.log_likelihood == pytest.approx(which.values(start[None])[0], abs=1e-3)
 
 

@@ -99,7 +99,7 @@ def test_one_more_count_does_what_the_response_says(name: str) -> None:
     """The score about the signal changes with a count before, and with one after."""
     model, data, signal = NOISE_LAWS[name], _drawn(name, 7), np.full(SHAPE, SIGNAL)
     before = np.full(SHAPE, 1000.0)
-    _, after = model.count_response(data, signal, 1.0, before, None)
+    _, after = model.count_response(data, signal, 1.0, before)
     terms = model.terms(data, signal, 0.0)
     more = data.copy()
     more[: 2 if name == "conditional" else 1] += 1

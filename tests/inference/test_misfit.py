@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -157,13 +156,3 @@ def _noticed(experiment: Setting, frame) -> None:  # type: ignore[no-untyped-def
         fit = _fit(experiment, bad, trial)
         assert fit.p_value < _fit(experiment, good, trial).p_value
         assert Status.POOR_FIT in fit.flags, (trial, fit.p_value)
-
-
-def test_sums_of_windows_are_what_the_main_job_would_measure() -> None:
-    experiment = setting("iscat", "mass", camera={"read_noise_e": 2.0})
-    windows = experiment.draw(experiment.truth, None)
-    at = experiment.config.bounds
-    assert windows.before_e == pytest.approx(at.n_before * at.photons_per_pixel)
-    assert windows.read_variance_after_e2 == pytest.approx(4.0 * at.n_after)
-    same = replace(windows, power=np.ones(0))
-    assert same.power_ratio == pytest.approx(at.n_after / at.n_before)

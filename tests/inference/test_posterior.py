@@ -91,17 +91,6 @@ def test_a_normal_prior_narrows_the_posterior_as_it_must(gaussian: Case) -> None
     )
 
 
-def test_likelihoods_belong_to_their_draws(gaussian: Case) -> None:
-    likelihood, fit = gaussian
-    result = sample_posterior(likelihood, fit, walkers=16, steps=300, seed=4)
-    thetas = np.tile(fit.theta, (16, 1))
-    thetas[:, :3] = result.samples[:, 7, :3]
-    thetas[:, 3] = [likelihood.model.scale.amplitude(m) for m in result.samples[:, 7, 3]]
-    np.testing.assert_allclose(
-        likelihood.values(thetas, pictured=True), result.log_likelihood[:, 7], rtol=1e-9
-    )
-
-
 def test_the_same_seed_draws_the_same(gaussian: Case) -> None:
     draws = [
         sample_posterior(*gaussian, walkers=10, steps=200, seed=seed).samples for seed in (1, 1, 2)

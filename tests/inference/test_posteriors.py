@@ -10,15 +10,9 @@ from microscopes import setting
 from scipy.stats import skew
 
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.posterior import Prior, sample_posterior, van_trees
-from iscat_analysis.records import PARAMETERS, FloatArray, PosteriorResult, Status
-from iscat_analysis.study import (
-    PosteriorRanks,
-    Setting,
-    calibrate_posterior,
-    run_trials,
-    trial_generator,
-)
+from iscat_analysis.inference.posterior import Prior, sample_posterior
+from iscat_analysis.records import FloatArray, PosteriorResult
+from iscat_analysis.study import PosteriorRanks, Setting, calibrate_posterior, trial_generator
 
 pytestmark = pytest.mark.large
 
@@ -66,34 +60,6 @@ def _sampled(experiment: Setting, truth: FloatArray, trial: int) -> tuple[Poster
     return sample_posterior(likelihood, fit, walkers=32, steps=1000, seed=trial), fit
 
 
-def test_a_height_between_two_fringes_has_two_peaks() -> None:
-    experiment = setting("iscat", "localize", photons=150.0, z_nm=500.0, fit=SMALL)
-    fringe = experiment.context.model.fringe_nm
-    for trial in range(100):
-        random = trial_generator(SEED, 3, trial)
-        likelihood = experiment.likelihood(experiment.draw(experiment.truth, random))
-        fit = fit_particle(
-            likelihood,
-            experiment.start(experiment.truth, random),
-            "localize",
-            (0.0, 1000.0),
-            level=False,
-        )
-        if fit.alternatives and fit.alternatives[0].log_likelihood_gap < 1:
-            break
-    else:
-        pytest.fail("no data set with two likely heights")
-    assert Status.AMBIGUOUS_Z in fit.flags
-    posterior, _ = _sampled(experiment, experiment.truth, trial)
-    assert posterior.converged, posterior.message
-    z = posterior.samples[..., posterior.names.index("z_nm")].ravel()
-    other = fit.alternatives[0].z_nm
-    here, there = (np.mean(np.abs(z - peak) < fringe / 4) for peak in (fit.z_nm, other))
-    assert min(here, there) > 0.1
-    # odds of the peaks: likelihood gap and the heights' own widths, known to a factor
-    assert 0.2 < (here / there) / math.exp(fit.alternatives[0].log_likelihood_gap) < 5
-
-
 def test_a_mass_near_zero_is_skewed_against_its_bound() -> None:
     """Where z is free the amplitude keeps its sign, and a faint particle's mass piles up at 0."""
     experiment = setting("iscat", "joint", fit={**SMALL, "z_range_nm": [0.0, 150.0]}, z_nm=60.0)
@@ -139,24 +105,3 @@ def test_the_sampled_posterior_reaches_van_trees_and_a_wrong_prior_does_not() ->
     assert math.log(math.sqrt(5)) > 4 * error
     wrong = math.log(np.sqrt(np.mean(_against_van_trees(experiment, width, 3 * width) ** 2)))
     assert wrong > 4 * error
-
-
-@pytest.mark.parametrize("relative", [0.5, 2.0])
-def test_van_trees_bound_is_reached_with_an_informative_prior(relative: float) -> None:
-    """Masses drawn from a normal prior: the posterior mean has the least possible error."""
-    trials = 400
-    experiment = setting("iscat", "mass", fit=SMALL)
-    crb = experiment.bounds.crb_joint[3]
-    width = relative * crb
-    truths = np.tile(experiment.truth, (trials, 1))
-    truths[:, 3] += np.random.default_rng(SEED).normal(0, width, trials)
-    found = run_trials(experiment, trials, seed=SEED, stream=9, truths=truths)
-    k = PARAMETERS.index("mass_kda")
-    weight, known = 1 / found.sigma[:, k] ** 2, 1 / width**2  # of a normal likelihood and prior
-    mean = (found.estimate[:, k] * weight + experiment.truth[k] * known) / (weight + known)
-    error = mean - truths[:, k]
-    bound = float(van_trees(np.array([[1 / crb**2]]), np.array([[1 / width**2]]))[0])
-    assert bound < crb
-    distance = math.log(math.sqrt(np.mean(error**2)) / bound) * math.sqrt(2 * trials)
-    assert abs(distance) < 4
-    assert np.sqrt(np.mean((found.estimate[:, k] - truths[:, k]) ** 2)) > bound

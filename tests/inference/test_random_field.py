@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import gaussian_filter, label, maximum_filter
 
-from iscat_analysis.inference.random_field import expected_maxima, extent, height_reached
+from iscat_analysis.inference.random_field import Excursions, expected_maxima, extent
 from iscat_analysis.search.peaks import summits
 
 SIDE, FINE, LEVEL = 256, 4, 3.3
@@ -90,10 +90,10 @@ def test_a_peak_is_known_between_its_pixels() -> None:
 def test_the_level_is_the_one_asked_for(alarms: float) -> None:
     area, volume = 4e3, 2e3
     for space, correlation in ((0.0, 0.0), (volume, 0.0), (0.0, 0.625)):
-        u = height_reached(alarms, area, space, correlation=correlation)
+        u = Excursions(area, space, correlation).level(alarms)
         assert expected_maxima(u, area, space, correlation=correlation) == pytest.approx(alarms)
 
 
 def test_few_places_have_the_lowest_level() -> None:
-    assert height_reached(1.0, 1.0, lowest=2.5) == 2.5
-    assert height_reached(1.0, 0.0, lowest=2.5) == 2.5
+    assert Excursions(1.0).level(1.0, lowest=2.5) == 2.5
+    assert Excursions(0.0).level(1.0, lowest=2.5) == 2.5

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from microscopes import setting
+from scenes import observed_information
 
 from iscat_analysis.inference.fit import AWAY, fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
@@ -45,7 +46,7 @@ def test_many_photons_leave_errors_to_the_curvature() -> None:
     experiment = setting("iscat", "joint", photons=3000.0, z_nm=200.0, camera=points)
     likelihood, fit = _trial(experiment, 0)
     free = np.flatnonzero(fit.box.free)
-    observed = likelihood.observed_information(fit.theta)[np.ix_(free, free)]
+    observed = observed_information(likelihood, fit.theta)[np.ix_(free, free)]
     np.testing.assert_allclose(
         fit.sigma[:3], np.sqrt(np.diag(np.linalg.inv(observed)))[:3], rtol=1e-9
     )

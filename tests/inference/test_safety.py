@@ -14,7 +14,7 @@ from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.laws import POISSON
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.records import Candidate
+from iscat_analysis.records import Box, Candidate
 
 GRID = PixelGrid.region((0, 15), (0, 17), PIXEL_NM)
 CENTRE = (8.2 * PIXEL_NM, 6.7 * PIXEL_NM)
@@ -65,7 +65,7 @@ def test_outside_the_support_nothing_is_likely(
     assert told == -math.inf
     assert np.isnan(score).all()
     assert np.isnan(fisher).all()
-    for refused in (which.signal, which.residuals, which.observed_information):
+    for refused in (which.signal, which.residuals):
         with pytest.raises(ConfigError, match="the model is known for z_nm from 0 to 1000"):
             refused(point)
 
@@ -113,24 +113,24 @@ def test_a_box_that_leaves_the_support_is_refused(
     low, high = np.array([*lower, 0.0, 0.0]), np.array([*upper, 1e5, 0.0])
     start = np.clip(theta, low, high)
     with pytest.raises(ConfigError, match="narrow the box"):
-        which.maximize(start, ALL, low, high)
+        which.maximize(start, Box(ALL, low, high))
 
 
 def test_a_start_outside_its_box_is_refused(which: Likelihood, theta: np.ndarray) -> None:
     margin = np.array([100.0, 100.0, 50.0, theta[3], 0.0])
     start = theta + np.array([200.0, 0.0, 0.0, 0.0, 0.0])
     with pytest.raises(ConfigError, match="outside the box"):
-        which.maximize(start, ALL, theta - margin, theta + margin)
+        which.maximize(start, Box(ALL, theta - margin, theta + margin))
     start[0] = math.nan
     with pytest.raises(ConfigError, match="outside the box"):
-        which.maximize(start, ALL, theta - margin, theta + margin)
+        which.maximize(start, Box(ALL, theta - margin, theta + margin))
 
 
 def test_a_box_without_end_for_the_amplitude_is_safe(which: Likelihood, theta: np.ndarray) -> None:
     margin = np.array([100.0, 100.0, 50.0, math.inf, 0.0])
     start = theta.copy()
     start[3] = 1e160  # its square overflows
-    found = which.maximize(start, ALL, theta - margin, theta + margin)
+    found = which.maximize(start, Box(ALL, theta - margin, theta + margin))
     assert not found.converged
 
 
@@ -146,13 +146,13 @@ def test_parameters_of_another_shape_are_refused(thetas: object, which: Likeliho
 
 
 def test_a_single_theta_of_another_shape_is_refused(which: Likelihood, theta: np.ndarray) -> None:
-    for call in (which.score_fisher, which.signal, which.residuals, which.observed_information):
+    for call in (which.score_fisher, which.signal, which.residuals):
         with pytest.raises(DataError, match="theta: has shape"):
             call(theta[:4])
     with pytest.raises(DataError, match="start: has shape"):
-        which.maximize(theta[:4], ALL, theta, theta)
+        which.maximize(theta[:4], Box(ALL, theta, theta))
     with pytest.raises(DataError, match="free: has shape"):
-        which.maximize(theta, ALL[:4], theta, theta)
+        which.maximize(theta, Box(ALL[:4], theta, theta))
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.int16, np.int32, np.uint64, np.float32])
@@ -185,7 +185,7 @@ COUNTS = np.full(GRID.shape, 100.0)
         ({"power_ratio": np.ones(3)}, "power_ratio: has shape"),
         ({"power_ratio": -1.0}, "power_ratio = -1: give"),
         ({"power_ratio": math.nan}, "power_ratio: is not finite"),
-        ({"read_variance_after_e2": -4.0}, "read_variance_after_e2 = -4: must be at least 0"),
+        ({"read_variances_e2": (0.0, -4.0)}, "read_variance_after_e2 = -4: must be at least 0"),
         ({"masked": COUNTS}, "masked: holds float64"),
         ({"masked": np.zeros((2, 2), dtype=bool)}, "masked: has shape"),
     ],

@@ -168,7 +168,7 @@ def _rounds(shares: tuple[float, float], count: int) -> Rounds:
         values["focus_nm"], values["reference_phase_deg"] = -300.0 + error[0], error[1]
         after = with_settings(config, values)
         found = _learned(names, np.diag([0.4, 0.2]) ** 2)
-        rounds = rounds.with_one(Round(Collected(config, ()), True, found, after, after, ""))
+        rounds = Rounds((*rounds.all, Round(Collected(config, ()), True, found, after, after, "")))
         config = rounds.next
     return rounds
 

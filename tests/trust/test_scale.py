@@ -20,7 +20,7 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import counts_likelihood
 from iscat_analysis.inference.laws import CONDITIONAL
 from iscat_analysis.optics.forward import PixelGrid, forward_model, signed_peak
-from iscat_analysis.records import EVENT_COLUMNS, Status
+from iscat_analysis.records import EVENT_COLUMNS, Box, Status
 from iscat_analysis.trust.systematic import (
     budget_of,
     contributions,
@@ -217,7 +217,9 @@ def _refitted(config: Config, key: str, mass: float, step: float) -> float:
     )
     start = np.array([0.0, 0.0, 5.0, amplitude, 0.0])
     width = np.array([150.0, 150.0, 0.0, 0.5 * abs(amplitude), 0.1])
-    found = likelihood.maximize(start, width > 0, start - width, start + width, tolerance=1e-10)
+    found = likelihood.maximize(
+        start, Box(width > 0, start - width, start + width), tolerance=1e-10
+    )
     return float(found.theta[3] / amplitude - 1)
 
 

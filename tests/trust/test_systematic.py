@@ -29,7 +29,7 @@ from iscat_analysis.instrument.joint_fit import Estimate, maximise
 from iscat_analysis.instrument.particle_image import ParticleImage, build_microscope
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.parameters import FREE, PRIMARY, free_names, prior_of, settings_of
-from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, PARAMETERS, FloatArray
+from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, PARAMETERS, Box, FloatArray
 from iscat_analysis.trust.response import Response, response_of
 from iscat_analysis.trust.systematic import contributions
 
@@ -75,7 +75,9 @@ def _fitted(
     width = np.array([150.0, 150.0, 60.0, 0.5 * abs(amplitude), 0.0])
     free = np.array([name in FREE_PARAMETERS[mode] for name in PARAMETERS] + [False])
     width = np.where(free, width, 0.0)
-    found = likelihood.maximize(start, free, start - width, start + width, tolerance=1e-9).theta
+    found = likelihood.maximize(
+        start, Box(free, start - width, start + width), tolerance=1e-9
+    ).theta
     mass = float(model.scale.mass(np.asarray(found[3])))
     places = dict(zip(PARAMETERS, (*map(float, found[:3]), mass), strict=True))
     return places | {"contrast": model.amplitude_contrast(float(found[2]), float(found[3]))}
