@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from importlib.metadata import version
 
 import numpy as np
 
@@ -29,8 +30,10 @@ from iscat_analysis.instrument.particle_image import (
     PRIVATE,
     RINGS_NM,
     TESTED,
+    Images,
     ParticleImage,
     build_microscope,
+    contrast_of,
 )
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.model import ForwardModel
@@ -69,43 +72,58 @@ _KNOWN_APART_NM = (APART_NM, 1600.0, 1300.0, 1000.0, 700.0)
 _PARTS = 8  # of a movie, that are searched where all of it is asked for
 
 
+@dataclass(frozen=True)
+class Recording:
+    """A movie, and what its pictures are found with."""
+
+    movie: Stack
+    config: Config
+    camera: Camera
+    pool: ThreadPoolExecutor
+    opening: NoiseSurvey | None = None
+
+    def summed(self) -> Windows:
+        """Sum the frames before and after particles bound."""
+        ranges = frame_ranges(self.movie, self.config)
+        return measured_windows(self.movie, self.config, self.camera, *ranges)
+
+    def origin(self, kind: str = "") -> dict[str, str]:
+        """Say what movie it is and what it shows, for the record of a calibration."""
+        sliding = background_mode(self.config) == "sliding"
+        return {
+            "movie": self.movie.path.name,
+            "sha256": self.movie.sha256(),
+            "kind": kind or ("landing movie" if sliding else "frames before and after"),
+            "version": version("iscat-analysis"),
+        }
+
+
 def bright_particle_images(
-    movie: Stack,
-    config: Config,
-    camera: Camera,
-    pool: ThreadPoolExecutor,
-    opening: NoiseSurvey | None = None,
-    rings: bool = True,
-    whole: bool = False,
-) -> tuple[list[ParticleImage], list[ParticleImage]]:
+    recording: Recording, *, rings: bool = True, whole: bool = False
+) -> tuple[Images, Images]:
     """Find the bright particles of a movie, in the way in which it is analysed.
 
     Particles with heights of their own are known only from fits of the whole field: there are none
     then, where frames before and after are compared.
     """
-    if background_mode(config) == "sliding":
-        if opening is not None:
-            return landing_particle_images(
-                opening.reader, opening.window, config, pool, rings, whole
-            )
+    movie, config, camera = recording.movie, recording.config, recording.camera
+    if background_mode(config) != "sliding":
+        if heights_free(config) and background_mode(config) == "fixed":
+            return [], []
+        return bright_places(recording.summed(), config)
+    if (opening := recording.opening) is not None:
+        reader, window = opening.reader, opening.window
+    else:
         reader = reader_of(movie, config, camera, fitted_frames(movie, config))
         window = judge_window(reader.sampled, config)[2]
-        return landing_particle_images(reader, window, config, pool, rings, whole)
-    if heights_free(config) and background_mode(config) == "fixed":
-        return [], []
-    windows = measured_windows(movie, config, camera, *frame_ranges(movie, config))
-    return bright_places(windows, config)
-
-
-def kind_of(config: Config) -> str:
-    """Say what such a movie shows, for the record of a calibration."""
-    return "landing movie" if background_mode(config) == "sliding" else "frames before and after"
+    return landing_particle_images(reader, window, recording, rings=rings, whole=whole)
 
 
 def landing_particle_images(
-    reader: Reader, window: int, config: Config, pool: ThreadPoolExecutor, rings: bool, whole: bool
-) -> tuple[list[ParticleImage], list[ParticleImage]]:
+    reader: Reader, window: int, recording: Recording, *, rings: bool, whole: bool
+) -> tuple[Images, Images]:
     """Find bright steps of a landing movie, chunk by chunk until there are enough."""
+    config, pool = recording.config, recording.pool
     stride = stride_of(window)
     found: list[BrightStep] = []
     rest: list[BrightStep] = []
@@ -135,13 +153,8 @@ def landing_particle_images(
             motion=pattern,
             mapper=pool.map,
         )
-        alone, around = steps.alone(most), steps.every() if rings else ()
-        if part.tile is not None:
-            found += _in_field(alone, part.tile)
-            rest += _in_field(around, part.tile)
-        else:
-            found += alone
-            rest += around
+        found += _in_field(steps.alone(most), part.tile)
+        rest += _in_field(steps.every() if rings else (), part.tile)
         bright = [step for step in found if step.snr > FAINTEST]
         if len(bright) >= enough and not whole:
             break
@@ -149,21 +162,17 @@ def landing_particle_images(
     unique = _standards(_without_repeats(bright))
     others = _without_repeats(rest)
     model = build_microscope(config, 1000.0, settings_of(config))
-    images = [
-        [
-            replace(
-                _particle_image_of(step, config, model),
-                neighbours=_neighbours(step, others, config),
-            )
-            for step in steps
-        ]
+    images, around = (
+        [_particle_image_of(step, others, config, model) for step in steps]
         for steps in (unique[:MOST_IMAGES], others)
-    ]
-    return images[0], images[1]
+    )
+    return images, around
 
 
-def _in_field(steps: Iterable[BrightStep], tile: Tile) -> list[BrightStep]:
+def _in_field(steps: Iterable[BrightStep], tile: Tile | None) -> list[BrightStep]:
     """Keep the steps of the core of a tile, and count their places from the corner of the field."""
+    if tile is None:
+        return list(steps)
     y, x = tile.corner
     moved = [
         replace(
@@ -224,7 +233,7 @@ def _without_repeats(steps: Iterable[BrightStep]) -> list[BrightStep]:
 
 def bright_places(
     windows: Windows, config: Config, alone_nm: float = APART_NM
-) -> tuple[list[ParticleImage], list[ParticleImage]]:
+) -> tuple[Images, Images]:
     """Find bright particles that bound between two ranges of frames."""
     ratio = windows.power_ratio
     # the noise of a known background is none
@@ -250,7 +259,7 @@ def bright_places(
 
 def known_places(
     windows: Windows, config: Config, known: Sequence[FloatArray], least: int
-) -> tuple[list[ParticleImage], list[ParticleImage]]:
+) -> tuple[Images, Images]:
     """Cut out particles that are known, those that are farthest from others.
 
     Shapes: `known` (5,).
@@ -258,7 +267,7 @@ def known_places(
     pixel, cut_out = _pixel_nm(config), _cutter(windows, config)
     heights = config.fit.z_range_nm if heights_free(config) else None
 
-    def cut(chosen: FloatArray, side: int) -> list[ParticleImage]:
+    def cut(chosen: FloatArray, side: int) -> Images:
         places = np.rint(chosen[:, 1::-1] / pixel).astype(int).tolist()
         return [
             replace(cut_out(row, column, side).moved(theta), heights_nm=heights)
@@ -285,41 +294,40 @@ def known_places(
 def _cutter(windows: Windows, config: Config) -> Callable[[int, int, int], ParticleImage]:
     """Give what cuts a square out of the field, as far as it goes."""
     model = build_microscope(config, 1000.0, settings_of(config))
-    shape, ratio = windows.after_e.shape, windows.power_ratio
+    shape, background = windows.after_e.shape, variance_of_background(config)
+    noise = choose_noise("auto", interferes=True, counted=config.background.is_counted)
 
     def cut_out(row: int, column: int, side: int) -> ParticleImage:
         (top, bottom), (left, right) = _region(row, column, side)
         rows = max(top, 0), min(bottom, shape[0])
         columns = max(left, 0), min(right, shape[1])
         grid = PixelGrid.region(rows, columns, _pixel_nm(config))
-        cut = slice(*rows), slice(*columns)
+        part = windows.cut((slice(*rows), slice(*columns)))
+        counts = model, grid, part.before_e, part.after_e, windows.power_ratio
+        reads = part.read_variance_before_e2, part.read_variance_after_e2
         likelihood = counts_likelihood(
-            model, grid, windows.before_e[cut], windows.after_e[cut], ratio,
-            background=variance_of_background(config),
-            noise=choose_noise("auto", interferes=True, counted=config.background.is_counted),
-            read_variance_before_e2=windows.read_variance_before_e2[cut],
-            read_variance_after_e2=windows.read_variance_after_e2[cut],
-            masked=windows.masked[cut],
-        )  # fmt: skip
+            *counts, background=background, noise=noise, read_variances_e2=reads, masked=part.masked
+        )
         return _centred(likelihood, config)
 
     return cut_out
 
 
-def _among(image: ParticleImage, others: Sequence[ParticleImage], least_nm: float) -> ParticleImage:
+def _among(image: ParticleImage, others: Images, least_nm: float) -> ParticleImage:
     """Tell an image which of the others are near, but not so near that they are the same."""
     apart = [math.hypot(image.x_nm - o.x_nm, image.y_nm - o.y_nm) for o in others]
     near = [(k, 1.0) for k, d in enumerate(apart) if least_nm < d < RINGS_NM]
     return replace(image, neighbours=tuple(near))
 
 
-def scan_particle_images(movie: Stack, config: Config, camera: Camera) -> list[ParticleImage]:
+def scan_particle_images(recording: Recording) -> Images:
     """Cut the particles of a scan of the focus out of its frames.
 
     The particles stay where they are, so that no frame shows the background alone.  It comes from
     ``background.frames`` where the movie has some; otherwise it is taken for even around each
     particle, at a level that is fitted in every picture.
     """
+    movie, config, camera = recording.movie, recording.config, recording.camera
     known = config.background.recorded
     start = known[1] if known else 0
     first, last = config.fit.frames or (start, movie.shape[0])
@@ -331,13 +339,12 @@ def scan_particle_images(movie: Stack, config: Config, camera: Camera) -> list[P
     if known:
         n_before = known[1] - known[0]
         background = camera.to_electrons(movie.read(*known)).sum(axis=0)
-    ratios = np.array([np.median(frame / background) for frame in frames])
-    energies = []
-    for frame, ratio in zip(frames, ratios, strict=True):
-        noise = ratio**2 * (background + n_before * read) if n_before else 0.0
-        energies.append(
-            energy_of(frame - ratio * background, frame + read + noise, frame > 0, _spot_px(config))
-        )
+    ratios = [float(np.median(frame / background)) for frame in frames]
+    noise = background + n_before * read if n_before else np.zeros(read.shape)
+    energies = [
+        energy_of(f - r * background, f + read + r**2 * noise, f > 0, _spot_px(config))
+        for f, r in zip(frames, ratios, strict=True)
+    ]
     energy = np.mean(energies, axis=0) * math.sqrt(len(energies))
     places = find_bright_places(
         energy, pixel_nm=_pixel_nm(config), alone_nm=ALONE_NM, roi_px=_roi_px(config)
@@ -354,59 +361,50 @@ def scan_particle_images(movie: Stack, config: Config, camera: Camera) -> list[P
         masked = np.asarray(saturated)[cut]
         seen: list[ParticleImage] = []
         for index in taken.astype(int):
-            frame, ratio = frames[index][cut], float(ratios[index])
+            frame = frames[index][cut]
             if n_before:
-                likelihood = conditional(
-                    model, grid, background[cut], frame, ratio,
-                    read_variance_before_e2=n_before * read[cut],
-                    read_variance_after_e2=read[cut], masked=masked,
-                )  # fmt: skip
+                sums = background[cut], frame, ratios[index]
+                reads = n_before * read[cut], read[cut]
+                likelihood = conditional(model, grid, *sums, read_variances_e2=reads, masked=masked)
             else:
                 level = np.full(frame.shape, float(np.median(frame)))
                 likelihood = poisson(
                     model, grid, frame, level, level, extra_variance_e2=read[cut], masked=masked
                 )
             seen.append(replace(_centred(likelihood, config), focus_steps=float(index)))
-        weights = [image.snr**2 for image in seen]
-        x_nm, y_nm = (
-            float(np.average([getattr(image, key) for image in seen], weights=weights))
-            for key in ("x_nm", "y_nm")
-        )
+        places, weights = [(s.x_nm, s.y_nm) for s in seen], [s.snr**2 for s in seen]
+        x_nm, y_nm = np.average(places, axis=0, weights=weights).tolist()
         images += [replace(image, x_nm=x_nm, y_nm=y_nm) for image in seen]
     return _bright(images)
 
 
 def _centred(likelihood: Likelihood, config: Config) -> ParticleImage:
     """Make an image of a picture, from the centre of its energy."""
-    grid = likelihood.grid
-    information = likelihood.signal_information()
-    contrast = np.nan_to_num(likelihood.measured_signal())
-    used = information > 0
-    contrast = np.where(used, contrast - np.average(contrast, weights=information), 0.0)
-    variance = 1 / np.where(used, information, 1e-6)
-    y, x, snr = centre_of_energy(contrast, variance, grid.pixel_nm)
-    return ParticleImage(
-        grid=grid, noise=likelihood.noise, data=likelihood.data,
-        x_nm=float(grid.x_nm[0] + x * grid.pixel_nm), y_nm=float(grid.y_nm[0] + y * grid.pixel_nm),
-        z_nm=config.particle.nominal_height_nm, snr=snr,
-    )  # fmt: skip
+    grid, height = likelihood.grid, config.particle.nominal_height_nm
+    image = ParticleImage(grid, likelihood.noise, likelihood.data, 0.0, 0.0, height)
+    y, x, snr = centre_of_energy(*contrast_of(image), grid.pixel_nm)
+    x_nm, y_nm = (
+        float(axis[0] + at * grid.pixel_nm) for axis, at in ((grid.x_nm, x), (grid.y_nm, y))
+    )
+    return replace(image, x_nm=x_nm, y_nm=y_nm, snr=snr)
 
 
-def _bright(images: Iterable[ParticleImage]) -> list[ParticleImage]:
+def _bright(images: Iterable[ParticleImage]) -> Images:
     """Keep the pictures that are bright enough, the brightest first."""
     return sorted((s for s in images if s.snr > FAINTEST), key=lambda s: -s.snr)[:MOST_IMAGES]
 
 
-def _particle_image_of(step: BrightStep, config: Config, model: ForwardModel) -> ParticleImage:
-    """Make an image of a step."""
+def _particle_image_of(
+    step: BrightStep, others: Sequence[BrightStep], config: Config, model: ForwardModel
+) -> ParticleImage:
+    """Make an image of a step among others."""
     grid = PixelGrid.region(step.rows, step.columns, _pixel_nm(config))
-    likelihood = conditional(
-        model, grid, step.before_e, step.after_e, step.power_ratio * step.motion,
-        read_variance_before_e2=step.n_before * step.read_variance_e2,
-        read_variance_after_e2=step.n_after * step.read_variance_e2, masked=~step.usable,
-    )  # fmt: skip
-    middles = tuple(sum(frames) / 2 for frames in (step.frames_before, step.frames_after))
-    return replace(_centred(likelihood, config), frames=(middles[0], middles[1]))
+    reads = step.n_before * step.read_variance_e2, step.n_after * step.read_variance_e2
+    counts = step.before_e, step.after_e, step.power_ratio * step.motion
+    likelihood = conditional(model, grid, *counts, read_variances_e2=reads, masked=~step.usable)
+    frames = sum(step.frames_before) / 2, sum(step.frames_after) / 2
+    near = _neighbours(step, others, config)
+    return replace(_centred(likelihood, config), frames=frames, neighbours=near)
 
 
 def _pixel_nm(config: Config) -> float:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,18 +22,17 @@ from iscat_analysis.instrument.particle_image import (
     PRIVATE,
     ROAM_NM,
     Build,
+    Images,
     ParticleImage,
     models_of,
     with_masses,
 )
 from iscat_analysis.optics.forward import ForwardModel
+from iscat_analysis.optics.local import BASES
 from iscat_analysis.optics.parameters import MASK_NA, PARAMETERS, Prior, Settings
 from iscat_analysis.records import FloatArray, Mapper
 
-_PLACE_STEP_NM = 60.0
-_HEIGHT_STEP_NM = 20.0  # a fringe is some 200 nm high
-_LEVEL_STEP = 0.5
-_Z = 2  # of what is an image's own
+_OWN_STEPS = np.array([60.0, 60.0, 20.0, np.inf, 0.5])  # nm, kDa; a fringe is some 200 nm high
 _DAMPING = (1e-3, 1e8)  # first, and where the search gives up
 _TOGETHER = 5  # images of one task; a millisecond each
 
@@ -46,14 +46,13 @@ class Estimate:
 
     names: tuple[str, ...]
     values: Settings
-    images: tuple[ParticleImage, ...]
+    images: Images
     information: FloatArray
     scatter: FloatArray
     errors: FloatArray
     log_likelihood: float
     log_prior: float
     converged: bool
-    passes: int
 
     @property
     def log_posterior(self) -> float:
@@ -84,7 +83,7 @@ class Estimate:
 
 
 def maximise(
-    images: Sequence[ParticleImage],
+    images: Images,
     build: Build,
     start: Settings,
     names: Sequence[str],
@@ -99,12 +98,11 @@ def maximise(
 
     The prior is around the start where none is given.
     """
-    names = tuple(names)
-    values = dict(start)
+    names, values = tuple(names), dict(start)
     prior = prior or Prior(values)
-    walls = _walls(images)
-    private = np.clip([image.private for image in images], *walls)
-    at = _Point.evaluate(images, build, values, names, private, walls, mapper, prior)
+    joint = JointLikelihood(images, build, names, prior, mapper)
+    private = np.clip([image.private for image in images], *joint.walls)
+    at = joint.at(values, private)
     damping, used, converged = _DAMPING[0], 1, False
     while used < passes and damping < _DAMPING[1]:
         if at.gain(names) < tolerance:
@@ -112,8 +110,8 @@ def maximise(
             break
         shared, own = at.step(names, damping)
         trial_values = _limited(values, names, shared, limits or {})
-        moved = np.clip(private + own, *walls)
-        trial = _Point.evaluate(images, build, trial_values, names, moved, walls, mapper, prior)
+        moved = np.clip(private + own, *joint.walls)
+        trial = joint.at(trial_values, moved)
         used += 1
         if trial.value + trial.log_prior > at.value + at.log_prior:
             values, private, at = trial_values, moved, trial
@@ -130,21 +128,44 @@ def maximise(
         log_likelihood=at.value,
         log_prior=at.log_prior,
         converged=converged,
-        passes=used,
     )
 
 
 @dataclass(frozen=True)
-class Asked:
+class PictureScores:
     """How the likelihood of each picture changes with its own optics, to second order.
 
     Shapes: `information` (n, k, k), `score` (n, k), `scatter` (n, k, k).
     """
 
+    images: Images
     names: tuple[str, ...]
     information: FloatArray
     score: FloatArray
     scatter: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        images: Images,
+        build: Build,
+        settings: Settings,
+        names: Sequence[str],
+        mapper: Mapper = map,
+    ) -> PictureScores:
+        """Score what parameters and coefficients of the field change about the optics."""
+        bases = tuple(dict.fromkeys(b for name in names for b in BASES.get(name, (name,))))
+        private = np.array([image.private for image in images])
+        at = JointLikelihood(images, build, bases, mapper=mapper).at(settings, private)
+        information, score, _ = at.each(0.0)
+        return cls(images, bases, information, score, at.pixel_scatter()[0])
+
+    def slopes(self, names: Sequence[str]) -> FloatArray:
+        """Give what parameters change about the optics of every picture, shape (n, m, k)."""
+        changes = [[image.slopes(name) for name in names] for image in self.images]
+        return np.array(
+            [[[each.get(base, 0.0) for base in self.names] for each in of] for of in changes]
+        )
 
     def step(self, slopes: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Say how far the pictures ask to change what changes the optics of each by its slopes.
@@ -163,28 +184,59 @@ class Asked:
         return bound @ score, bound @ scatter @ bound
 
 
-def asked_changes(
-    images: Sequence[ParticleImage],
-    build: Build,
-    settings: Settings,
-    names: Sequence[str],
-    mapper: Mapper = map,
-) -> Asked:
-    """Look how pictures ask to change the optics."""
-    private, walls = np.array([image.private for image in images]), _walls(images)
-    at = _Point.evaluate(images, build, settings, tuple(names), private, walls, mapper)
-    information, score, _ = at.each(0.0)
-    return Asked(tuple(names), information, score, at.pixel_scatter()[0])
+@dataclass(frozen=True)
+class JointLikelihood:
+    """The likelihood of pictures, in parameters of the optics and what is each picture's own."""
 
+    images: Images
+    build: Build
+    names: tuple[str, ...]
+    prior: Prior | None = None
+    mapper: Mapper = map
 
-def _walls(images: Sequence[ParticleImage]) -> FloatArray:
-    """Bounds of what is an image's own, shape (2, n, 5): a particle stays in its picture."""
-    centres = np.array([(s.grid.x_nm.mean(), s.grid.y_nm.mean()) for s in images])
-    walls = np.full((2, len(images), PRIVATE), np.inf)
-    walls[0] = -np.inf
-    walls[0, :, :2], walls[1, :, :2] = centres - ROAM_NM, centres + ROAM_NM
-    walls[:, :, _Z] = np.transpose([s.heights_nm or (s.z_nm, s.z_nm) for s in images])
-    return walls
+    @cached_property
+    def walls(self) -> FloatArray:
+        """Bounds of what is an image's own, shape (2, n, 5): a particle stays in its picture."""
+        centres = np.array([(s.grid.x_nm.mean(), s.grid.y_nm.mean()) for s in self.images])
+        walls = np.full((2, len(self.images), PRIVATE), np.inf)
+        walls[0] = -np.inf
+        walls[0, :, :2], walls[1, :, :2] = centres - ROAM_NM, centres + ROAM_NM
+        walls[:, :, 2] = np.transpose([s.heights_nm or (s.z_nm, s.z_nm) for s in self.images])
+        return walls
+
+    def at(self, values: Settings, private: FloatArray) -> _Point:
+        """Evaluate all images; an unknown that its wall stops counts as known.
+
+        Shapes: `private` (n, 5).
+        """
+        models, names = models_of(self.images, self.build, values), self.names
+
+        def some(first: int) -> list[tuple[float, FloatArray, FloatArray, FloatArray]]:
+            these = slice(first, first + _TOGETHER)
+            each_of = zip(self.images[these], models[these], private[these], strict=True)
+            return [_scores(image, model, names, own) for image, model, own in each_of]
+
+        parts = self.mapper(some, range(0, len(self.images), _TOGETHER))
+        found = [each for part in parts for each in part]
+        value = math.fsum(each[0] for each in found)
+        score, fisher, squares = (np.array([each[part] for each in found]) for part in (1, 2, 3))
+        own, (low, high) = score[:, len(names) :], self.walls
+        stopped = (private <= low) & (own < 0) | (private >= high) & (own > 0) | (low == high)
+        free = np.pad(~stopped, ((0, 0), (len(names), 0)), constant_values=True)
+        both = free[:, :, None] & free[:, None, :]
+        alone = np.eye(free.shape[1]) * ~free[:, None, :]
+        changes, errors = np.zeros(len(names)), np.full(len(names), np.inf)
+        if self.prior is not None:
+            changes, errors = self.prior.changes(values, names), self.prior.errors(names)
+        return _Point(
+            value if math.isfinite(value) else -math.inf,
+            np.where(free, score, 0.0),
+            np.where(both, fisher, alone),
+            np.where(both, squares, 0.0),
+            -0.5 * float(changes @ changes),
+            -changes / errors,
+            errors**-2.0,
+        )
 
 
 def _limited(
@@ -196,8 +248,7 @@ def _limited(
     """Take a step and stay inside the limits."""
     out = dict(values)
     for name, move in zip(names, step, strict=True):
-        low, high = limits.get(name, (-math.inf, math.inf))
-        out[name] = float(min(max(values[name] + move, low), high))
+        out[name] = float(np.clip(values[name] + move, *limits.get(name, (-math.inf, math.inf))))
     if "mask_na" in names:
         out["mask_na"] = min(out["mask_na"], out["na"] - MASK_NA)
     return out
@@ -214,53 +265,6 @@ class _Point:
     log_prior: float
     pull: FloatArray  # (k,), slope of the logarithm of the prior
     precision: FloatArray  # (k,), its information
-
-    @classmethod
-    def evaluate(
-        cls,
-        images: Sequence[ParticleImage],
-        build: Build,
-        values: Settings,
-        names: tuple[str, ...],
-        private: FloatArray,
-        walls: FloatArray,
-        mapper: Mapper,
-        prior: Prior | None = None,
-    ) -> _Point:
-        """Evaluate all images; an unknown that its wall stops counts as known."""
-        models = models_of(images, build, values)
-
-        def some(first: int) -> list[tuple[float, FloatArray, FloatArray, FloatArray]]:
-            these = slice(first, first + _TOGETHER)
-            return [
-                _scores(image, model, names, own)
-                for image, model, own in zip(
-                    images[these], models[these], private[these], strict=True
-                )
-            ]
-
-        parts = mapper(some, range(0, len(images), _TOGETHER))
-        found = [each for part in parts for each in part]
-        value = math.fsum(each[0] for each in found)
-        score, fisher, squares = (np.array([each[part] for each in found]) for part in (1, 2, 3))
-        own = score[:, len(names) :]
-        stopped = (private <= walls[0]) & (own < 0) | (private >= walls[1]) & (own > 0)
-        stopped |= walls[0] == walls[1]
-        free = np.pad(~stopped, ((0, 0), (len(names), 0)), constant_values=True)
-        both = free[:, :, None] & free[:, None, :]
-        alone = np.eye(free.shape[1]) * ~free[:, None, :]
-        changes, errors = np.zeros(len(names)), np.full(len(names), np.inf)
-        if prior is not None:
-            changes, errors = prior.changes(values, names), prior.errors(names)
-        return cls(
-            value if math.isfinite(value) else -math.inf,
-            np.where(free, score, 0.0),
-            np.where(both, fisher, alone),
-            np.where(both, squares, 0.0),
-            -0.5 * float(changes @ changes),
-            -changes / errors,
-            errors**-2.0,
-        )
 
     def scatter(self, owners: Sequence[int]) -> FloatArray:
         """Covariance of the reduced score from the residuals, shape (k, k).
@@ -327,10 +331,7 @@ class _Point:
             shared = shared / max(1.0, float(np.max(np.abs(shared) / largest)))
         rest = self.score[:, k:] - np.einsum("eij,i->ej", self.fisher[:, :k, k:], shared)
         own = np.einsum("eij,ej->ei", inverse, rest)
-        own[:, :2] = np.clip(own[:, :2], -_PLACE_STEP_NM, _PLACE_STEP_NM)
-        own[:, _Z] = np.clip(own[:, _Z], -_HEIGHT_STEP_NM, _HEIGHT_STEP_NM)
-        own[:, LEVEL] = np.clip(own[:, LEVEL], -_LEVEL_STEP, _LEVEL_STEP)
-        return shared, own
+        return shared, np.clip(own, -_OWN_STEPS, _OWN_STEPS)
 
 
 def excess(scatter: FloatArray, scores: FloatArray, owners: NDArray[np.int64]) -> float:
@@ -354,12 +355,10 @@ def _solve(
     information: FloatArray, score: FloatArray, names: tuple[str, ...], damping: float
 ) -> FloatArray:
     """Solve the damped normal equations in units of the usual errors."""
-    if not names:
-        return np.empty(0)
     scale = np.array([PARAMETERS[name].usual_error for name in names])
     scaled = information * np.outer(scale, scale)
-    ridge = damping * np.diag(scaled)
-    return np.asarray(scale * np.linalg.solve(scaled + np.diag(ridge), scale * score))
+    ridge = np.diag(damping * np.diag(scaled))
+    return np.asarray(scale * np.linalg.solve(scaled + ridge, scale * score))
 
 
 def _scores(
@@ -392,13 +391,13 @@ _NEIGHBOUR_PASSES = 6
 class Neighbours:
     """Particles with the rings that they make in one microscope."""
 
-    particles: tuple[ParticleImage, ...]
+    particles: Images
     wide: ForwardModel
 
     @classmethod
     def fitted(
         cls,
-        others: Sequence[ParticleImage],
+        others: Images,
         build: Build,
         build_wide: Build,
         settings: Settings,
@@ -406,7 +405,7 @@ class Neighbours:
     ) -> Neighbours:
         """Fit them, and once more among each other's rings."""
 
-        def own(images: Sequence[ParticleImage]) -> tuple[ParticleImage, ...]:
+        def own(images: Images) -> Images:
             return maximise(
                 images, build, settings, (), passes=_NEIGHBOUR_PASSES, mapper=mapper
             ).images
@@ -414,9 +413,7 @@ class Neighbours:
         first = cls(own(with_masses(others, build, settings)), build_wide(settings))
         return cls(own(first.around(first.particles, mapper)), first.wide)
 
-    def around(
-        self, images: Sequence[ParticleImage], mapper: Mapper = map
-    ) -> tuple[ParticleImage, ...]:
+    def around(self, images: Images, mapper: Mapper = map) -> Images:
         """Put their rings into what is expected of pictures.
 
         Every particle is drawn into all pictures at once: its field at its height takes longest.

@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib.metadata import version
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,18 +31,16 @@ from iscat_analysis.diagnosis import (
 )
 from iscat_analysis.errors import ConfigError, ContrastError, DataError
 from iscat_analysis.findings import Finding, printing
-from iscat_analysis.findings.optics import (
-    OPTICS_AS_CONFIGURED,
-    OPTICS_LEARNED,
-    OPTICS_NOT_LEARNED,
-    TURNED_PHASE,
-    WRONG_SIGN,
-)
-from iscat_analysis.fitting.ranges import background_mode, frame_ranges, measured_windows
+from iscat_analysis.findings import optics as of
+from iscat_analysis.fitting.ranges import background_mode
 from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.inference.checks import number_in
-from iscat_analysis.instrument.collect import bright_particle_images, kind_of, scan_particle_images
-from iscat_analysis.instrument.joint_fit import Neighbours, asked_changes, excess, maximise
+from iscat_analysis.instrument.collect import (
+    Recording,
+    bright_particle_images,
+    scan_particle_images,
+)
+from iscat_analysis.instrument.joint_fit import Neighbours, PictureScores, excess, maximise
 from iscat_analysis.instrument.loop import (
     StandingAlone,
     WholeField,
@@ -57,6 +56,7 @@ from iscat_analysis.instrument.particle_image import (
     TESTED,
     Build,
     Collected,
+    Images,
     ParticleImage,
     average_particle_images,
     goodness,
@@ -70,15 +70,15 @@ from iscat_analysis.instrument.particle_image import (
 )
 from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.instrument.uneven import (
-    EVEN,
+    NO_CHANGE,
     Change,
     FieldOfView,
     asked_change,
     in_uneven_field,
 )
 from iscat_analysis.movie import Stack
-from iscat_analysis.optics.forward import ForwardModel, forward_model, signed_peak
-from iscat_analysis.optics.local import BASES, terms_of
+from iscat_analysis.optics.forward import forward_model, signed_peak
+from iscat_analysis.optics.local import terms_of
 from iscat_analysis.optics.parameters import (
     FIELD,
     FREE,
@@ -91,7 +91,7 @@ from iscat_analysis.optics.parameters import (
     prior_of,
     settings_of,
 )
-from iscat_analysis.records import FloatArray, Mapper, Progress, Windows, silent
+from iscat_analysis.records import FloatArray, Mapper, Progress, silent
 from iscat_analysis.search.frames import measure_frames, well_lit
 from iscat_analysis.threads import threads
 from iscat_analysis.trust.systematic import REJECTED_SHARE
@@ -111,49 +111,86 @@ _CLEAR = 10.0  # standard errors of χ² by which a wrong microscope would be se
 _DESCRIBED = 0.1  # of that, which a picture that is described has at most
 
 
+class _AsConfigured(NamedTuple):
+    """The configured microscope, in which the brightest particles are fitted."""
+
+    settings: Settings
+    build: Build
+    build_wide: Build
+    mapper: Mapper
+
+    @classmethod
+    def of(cls, config: Config, images: Images, mapper: Mapper) -> _AsConfigured:
+        """Build it as far as the pictures need."""
+        reach = max(map(reach_nm, images)) + math.sqrt(2) * _STARTS_NM[-1]
+        build, wide = microscopes(config, reach), rings_of(config, images[0])
+        return cls(settings_of(config), build, wide, mapper)
+
+    def placed(self, images: Images) -> Images:
+        """Fit the masses where the particles stand."""
+        return with_masses(images, self.build, self.settings)
+
+    def fitted(self, images: Images) -> Images:
+        """Fit what is an image's own."""
+        return maximise(images, self.build, self.settings, (), mapper=self.mapper).images
+
+    def among(self, others: Images, images: Images) -> Images:
+        """Fit pictures among the rings of others."""
+        near = Neighbours.fitted(others, self.build, self.build_wide, self.settings, self.mapper)
+        return self.fitted(near.around(images, self.mapper))
+
+    def goodness(self, images: Images) -> tuple[FloatArray, FloatArray]:
+        """Give the reduced χ² and the p-value of every fitted picture."""
+        chi2, p = np.transpose([goodness(image, self.build(self.settings)) for image in images])
+        return chi2, p
+
+    def centre(self, image: ParticleImage) -> tuple[float, float]:
+        """Find the particle in a picture [nm], whose brightest spot may be of a ring.
+
+        From a place half a ring away a fit ends in another optimum, with the mass of the other
+        sign.
+        """
+        image = image.placed(image.x_nm, image.y_nm)
+        moves = product(_STARTS_NM, _STARTS_NM)
+        starts = self.placed([image.placed(image.x_nm + x, image.y_nm + y) for x, y in moves])
+        likely = [starts[k] for k in np.argsort(self.goodness(starts)[0], kind="stable")[:3]]
+        alone = self._replace(mapper=map)
+        fits = [alone.fitted([one])[0] for one in likely]
+        best = fits[int(np.argmin(self.goodness(fits)[0]))]
+        return best.x_nm, best.y_nm
+
+
 def median_p(
-    images: list[ParticleImage],
-    config: Config,
-    others: Sequence[ParticleImage] = (),
-    mapper: Mapper = map,
-) -> tuple[float, Sequence[ParticleImage]]:
+    images: Images, config: Config, others: Images = (), mapper: Mapper = map
+) -> tuple[float, Images]:
     """Give the median p-value of the brightest particles in the configured microscope.
 
     The rings of neighbours, where any are known, are put into the pictures that fail without.
     Particles whose heights are open stand at the height that most of them tell.
     """
-    settings = settings_of(config)
-    build = microscopes(config, max(map(reach_nm, images)) + math.sqrt(2) * _STARTS_NM[-1])
-    model = build(settings)
-    shown: Sequence[ParticleImage] = images[:TESTED]
+    as_configured = _AsConfigured.of(config, images, mapper)
+    shown: Images = images[:TESTED]
     x, y = 0.0, 0.0
     if not heights_free(config):
         averages, shown = average_particle_images(shown)
-        x, y = _centre(averages[0], model, build, settings)
-
-    def median(pictures: Sequence[ParticleImage]) -> tuple[float, Sequence[ParticleImage]]:
-        fitted = maximise(pictures, build, settings, (), mapper=mapper).images
-        return float(np.median([goodness(image, model)[1] for image in fitted])), fitted
-
-    moved = [image.placed(image.x_nm + x, image.y_nm + y) for image in shown]
-    shown = with_masses(moved, build, settings)
+        x, y = as_configured.centre(averages[0])
+    shown = as_configured.placed([s.placed(s.x_nm + x, s.y_nm + y) for s in shown])
     if config.particle.height_is_open:
-        free = maximise(with_heights(shown, config), build, settings, (), mapper=mapper).images
+        free = as_configured.fitted(with_heights(shown, config))
         middle = float(np.median([image.z_nm for image in free]))
         shown = [replace(image, z_nm=middle) for image in shown]
-    found, fitted = median(shown)
+    fitted = as_configured.fitted(shown)
+    found = float(np.median(as_configured.goodness(fitted)[1]))
     if found >= REJECTED_P or not any(image.neighbours for image in fitted):
         return found, fitted
     elsewhere = [other.placed(other.x_nm + x, other.y_nm + y) for other in others]
-    near = Neighbours.fitted(elsewhere, build, rings_of(config, images[0]), settings, mapper)
-    return max((found, fitted), median(near.around(fitted, mapper)), key=lambda each: each[0])
+    among = as_configured.among(elsewhere, fitted)
+    better = float(np.median(as_configured.goodness(among)[1]))
+    return (found, fitted) if found >= better else (better, among)
 
 
 def not_alone(
-    images: Sequence[ParticleImage],
-    config: Config,
-    others: Sequence[ParticleImage] = (),
-    mapper: Mapper = map,
+    images: Images, config: Config, others: Images = (), mapper: Mapper = map
 ) -> tuple[list[int], float]:
     """Find bright places that the configured microscope describes badly, and others well.
 
@@ -161,21 +198,16 @@ def not_alone(
     are.  Where some as bright are described, the places that are not show two that landed at once.
     From a place that others drew aside a fit ends in another optimum: each begins anew here.
     """
-    settings = settings_of(config)
-    build = microscopes(config, max(map(reach_nm, images)) + math.sqrt(2) * _STARTS_NM[-1])
-    model = build(settings)
+    as_configured = _AsConfigured.of(config, images, mapper)
+    alone = as_configured._replace(mapper=map)
 
     def fitted(image: ParticleImage) -> ParticleImage:
-        x, y = _centre(image, model, build, settings)
-        (placed,) = with_masses([image.placed(x, y)], build, settings)
-        return maximise([placed], build, settings, ()).images[0]
+        return alone.fitted(alone.placed([image.placed(*alone.centre(image))]))[0]
 
-    some = list(mapper(fitted, images[:TESTED]))
+    some: Images = list(mapper(fitted, images[:TESTED]))
     if any(image.neighbours for image in some):
-        near = Neighbours.fitted(others, build, rings_of(config, some[0]), settings, mapper)
-        pictures = near.around(some, mapper)
-        some = list(maximise(pictures, build, settings, (), mapper=mapper).images)
-    chi2, p = np.transpose([goodness(image, model) for image in some])
+        some = as_configured.among(others, some)
+    chi2, p = as_configured.goodness(some)
     mass = np.array([image.mass_kda for image in some])
     poor = p < REJECTED_P
     if not poor.any() or poor.all():
@@ -187,25 +219,6 @@ def not_alone(
     if described.sum() < max(2, 0.25 * len(some)):
         return [], float(np.median(p))
     return np.flatnonzero(poor).tolist(), float(np.median(p[~poor]))
-
-
-def _centre(
-    image: ParticleImage, model: ForwardModel, build: Build, settings: Settings
-) -> tuple[float, float]:
-    """Find the particle in a picture [nm], whose brightest spot may be of a ring.
-
-    From a place half a ring away a fit ends in another optimum, with the mass of the other sign.
-    """
-    image = image.placed(image.x_nm, image.y_nm)
-    starts = [image.placed(image.x_nm + x, image.y_nm + y) for x in _STARTS_NM for y in _STARTS_NM]
-
-    def misfit(one: ParticleImage) -> float:
-        return goodness(one, model)[0]
-
-    likely = sorted(with_masses(starts, build, settings), key=misfit)[:3]  # of these starts
-    fits = [maximise([image], build, settings, ()).images[0] for image in likely]
-    best = min(fits, key=misfit)
-    return best.x_nm, best.y_nm
 
 
 @dataclass(frozen=True)
@@ -232,8 +245,7 @@ class ScoreTest:
     Shapes: `change` (n,), `covariance` (n, n).
     """
 
-    names: tuple[str, ...]
-    values: tuple[float, ...]
+    values: Mapping[str, float]
     """As configured."""
 
     change: FloatArray
@@ -261,7 +273,7 @@ class ScoreTest:
 
 
 def score_test(
-    images: Sequence[ParticleImage],
+    images: Images,
     build: Build,
     settings: Settings,
     prior: Prior,
@@ -277,17 +289,10 @@ def score_test(
     size, count = len(names), len(images)
     score, information = np.zeros((count, size)), np.zeros((count, size, size))
     if count:
-        bases = tuple(dict.fromkeys(base for name in names for base in BASES.get(name, (name,))))
-        asked = asked_changes(images, build, settings, bases, mapper)
-        slopes = np.array(
-            [
-                [[image.slopes(name).get(base, 0.0) for base in bases] for name in names]
-                for image in images
-            ]
-        )
-        score = np.einsum("nik,nk->ni", slopes, asked.score) * usual
-        information = np.einsum("nik,nkl,njl->nij", slopes, asked.information, slopes)
-        information *= np.outer(usual, usual)
+        scores = PictureScores.of(images, build, settings, names, mapper)
+        slopes = scores.slopes(names) * usual[:, None]
+        score = np.einsum("nik,nk->ni", slopes, scores.score)
+        information = np.einsum("nik,nkl,njl->nij", slopes, scores.information, slopes)
     total, asks = information.sum(axis=0), score.sum(axis=0)
     change = np.linalg.solve(np.eye(size) + total, asks)
     # residual scores, which no common change of the optics explains
@@ -306,9 +311,9 @@ def score_test(
     power = math.fsum(image.snr**2 for image in images)
     explained = float(expit(gain)) * explains[np.argmax(gains)]
     left_over = math.sqrt(explained / power) if power else 0.0
-    values = tuple(float(settings.get(name, 0.0)) for name in names)
+    values = {name: float(settings.get(name, 0.0)) for name in names}
     covariance = spread * np.outer(usual, usual)
-    return ScoreTest(names, values, usual * change, covariance, gain, left_over)
+    return ScoreTest(values, usual * change, covariance, gain, left_over)
 
 
 def _alternative(information: FloatArray, asks: FloatArray) -> tuple[float, float]:
@@ -353,7 +358,7 @@ def learn_optics(
     optics = config.optics
     reason = why_not(config)
     if reason and optics.calibrate == "always":
-        return Learned(config, {}, (OPTICS_NOT_LEARNED({"reason": reason}),))
+        return Learned(config, {}, (of.OPTICS_NOT_LEARNED({"reason": reason}),))
     if (
         reason
         or config.fit.mode == "track"  # which learns from its tracks
@@ -364,17 +369,17 @@ def learn_optics(
     tested: Tested | None = None
 
     def as_configured(reason: str, verdict: str = "") -> Learned:
-        finding = OPTICS_AS_CONFIGURED({"verdict": verdict or _verdict(tested), "reason": reason})
-        summary = {**(tested.summary if tested else {}), "calibrated": False, "reason": reason}
-        return Learned(config, summary, (finding,))
+        summary = tested.summary if tested else {}
+        return _as_configured(config, summary, verdict or _verdict(tested), reason)
 
     with threads(config.compute.workers) as pool:
+        recording = Recording(movie, config, camera, pool, opening)
         try:
-            tested = tested_optics(movie, config, camera, pool, opening)
+            tested = tested_optics(recording)
             passed = optics.calibrate == "auto" and not tested.rejected
             if passed and tested.particles and not tested.change.matters:
                 return Learned(config, tested.summary | {"calibrated": False})
-            if optics.calibrate == "auto" and noise_differs(movie, config, camera):
+            if optics.calibrate == "auto" and noise_differs(recording):
                 tested = replace(tested, together=_together((), config, pool))
                 return as_configured(NOISE, _NOT_TESTED)
             if not tested.particles:
@@ -382,14 +387,14 @@ def learn_optics(
             notify("learning the optics from the particles of the movie, which may take minutes…")
             origin = {"movie": movie.name}
             if passed:
-                view = FieldOfView.of(movie, config, in_time=background_mode(config) == "sliding")
+                view = FieldOfView.of(movie, config)
                 moved = in_uneven_field(tested.seen, settings_of(config), view, pool.map)
                 if moved is None:  # pictures that were not fitted want no change
                     return Learned(config, tested.summary | {"calibrated": False})
                 known = StandingAlone(moved, pool)
                 found = learn(known, config, tuple(FREE), origin, pool.map).outcome
             else:
-                found = learned_from(tested.seen, movie, config, camera, tuple(FREE), origin, pool)
+                found = learned_from(tested.seen, recording, tuple(FREE), origin)
         except DataError as error:
             changing = tested is not None and tested.change.matters
             return as_configured(
@@ -408,7 +413,7 @@ class Tested:
 
     particles: int
     median_p: float | None
-    change: Change = EVEN
+    change: Change = NO_CHANGE
     """Over the field or in time, that they ask for."""
 
     together: ScoreTest | None = None
@@ -425,7 +430,7 @@ class Tested:
         test: dict[str, Any] = {"tested": self.particles, "median_p": self.median_p}
         if (one := self.together) is None:
             return test
-        errors = _with_errors(one.names, one.values, one.posterior, one.field_px)
+        errors = _with_errors(one.values, one.posterior, one.field_px)
         evidence = {"log_bayes_factor": one.log_bayes_factor, "left_over": one.left_over}
         return test | evidence | errors
 
@@ -437,59 +442,45 @@ def _are_rejected(median: float | None, together: ScoreTest | None) -> bool:
 
 
 def _with_errors(
-    names: Sequence[str],
-    values: Sequence[float],
-    covariance: FloatArray,
-    field_px: tuple[float, float, float] | None,
+    values: Mapping[str, float], covariance: FloatArray, field_px: Sequence[float] | None
 ) -> dict[str, Any]:
     """Describe the optics of an analysis, tested or learned, as parameters with errors."""
-    return {
-        "names": list(names),
-        "values": list(values),
-        "covariance": covariance.tolist(),
-        "field_px": None if field_px is None else list(field_px),
-    }
+    field, errors = None if field_px is None else list(field_px), covariance.tolist()
+    names, numbers = list(values), list(values.values())
+    return {"names": names, "values": numbers, "covariance": errors, "field_px": field}
 
 
-def tested_optics(
-    movie: Stack,
-    config: Config,
-    camera: Camera,
-    pool: ThreadPoolExecutor,
-    opening: NoiseSurvey | None,
-) -> Tested:
+def tested_optics(recording: Recording) -> Tested:
     """Collect the brightest particles and test the configured optics on them.
 
     Where these fail, or the focus moves, more particles are collected, with the rings of others.
     """
-    sliding, auto = background_mode(config) == "sliding", config.optics.calibrate == "auto"
-    first = sliding and auto
-    images, others = bright_particle_images(movie, config, camera, pool, opening, rings=not first)
-    alone = len(images)
-    if alone < _MANY and background_mode(config) == "fixed":
-        windows = _summed(movie, config, camera)
-        if drift_warning(movie.name, examine_background(movie, camera, windows)):
-            raise DataError("the edges of a fixed pattern that moved look like particles")
-        images, others = seen_in_field(windows, config, pool)
-    if not images:
-        return Tested(Collected(config, ()), 0, None, EVEN, _together((), config, pool))
-    median, fitted = median_p(images, config, others, pool.map)
-    together = _together(fitted, config, pool)
-    if first and _are_rejected(median, together):  # more particles, and whose rings they show
-        images, others = bright_particle_images(movie, config, camera, pool, opening)
+    config, pool, way = recording.config, recording.pool, background_mode(recording.config)
+    sliding, auto = way == "sliding", config.optics.calibrate == "auto"
+    for rings in (False, True) if sliding and auto else (True,):
+        images, others = bright_particle_images(recording, rings=rings)
         alone = len(images)
+        if alone < _MANY and way == "fixed":
+            windows, movie = recording.summed(), recording.movie
+            if drift_warning(movie.name, examine_background(movie, recording.camera, windows)):
+                raise DataError("the edges of a fixed pattern that moved look like particles")
+            images, others = seen_in_field(windows, config, pool)
+        if not images:
+            return Tested(Collected(config, ()), 0, None, NO_CHANGE, _together((), config, pool))
         median, fitted = median_p(images, config, others, pool.map)
         together = _together(fitted, config, pool)
-    change = EVEN
+        if not _are_rejected(median, together):  # else more particles, and whose rings they show
+            break
+    change = NO_CHANGE
     if not heights_free(config):
-        view = FieldOfView.of(movie, config, in_time=sliding)
+        view = FieldOfView.of(recording.movie, config)
         change = asked_change(fitted, config, settings_of(config), view, pool.map)
         over_field = [name for name in change.terms if name in FIELD]
         if over_field:
             together = _together(view.placed(fitted), config, pool, over_field)
             together = together and replace(together, field_px=view.centre_px)
     if sliding and change.matters:  # which the first particles of a long movie tell badly
-        images, others = bright_particle_images(movie, config, camera, pool, opening, whole=True)
+        images, others = bright_particle_images(recording, whole=True)
         alone = len(images)
     elif auto and median < REJECTED_P and not heights_free(config) and not change.matters:
         pairs, median = not_alone(images, config, others, pool.map)
@@ -502,10 +493,7 @@ def tested_optics(
 
 
 def _together(
-    fitted: Sequence[ParticleImage],
-    config: Config,
-    pool: ThreadPoolExecutor,
-    terms: Sequence[str] = (),
+    fitted: Images, config: Config, pool: ThreadPoolExecutor, terms: Sequence[str] = ()
 ) -> ScoreTest | None:
     """Test all images together against the configured optics."""
     if heights_free(config):
@@ -518,22 +506,28 @@ def why_not(config: Config) -> str:
     """Say of what movies, or with what configuration, no optics are learned."""
     optics, mode, way = config.optics, config.fit.mode, background_mode(config)
     tracks = mode == "track"
-    reasons = (
-        (
-            tracks and way != "tracks",
-            "in mode track over a background that is not learned with the tracks",
+    reasons = {
+        "in mode track over a background that is not learned with the tracks": (
+            tracks and way != "tracks"
         ),
-        (optics.scheme == "darkfield", "from dark field"),
-        (config.particle.is_sphere, f'with particle.model = "{config.particle.model}"'),
-        (optics.convention != "exact", f'with optics.convention = "{optics.convention}"'),
-        (optics.psf != "model", f'with optics.psf = "{optics.psf}"'),
-        (config.background.method == "known", 'with background.method = "known"'),
-        (
-            not tracks and heights_free(config) and way != "fixed",
-            f"in mode {mode} without background frames",
+        "from dark field": optics.scheme == "darkfield",
+        f'with particle.model = "{config.particle.model}"': config.particle.is_sphere,
+        f'with optics.convention = "{optics.convention}"': optics.convention != "exact",
+        f'with optics.psf = "{optics.psf}"': optics.psf != "model",
+        'with background.method = "known"': config.background.method == "known",
+        f"in mode {mode} without background frames": (
+            not tracks and heights_free(config) and way != "fixed"
         ),
-    )
-    return next((reason for holds, reason in reasons if holds), "")
+    }
+    return next((reason for reason, holds in reasons.items() if holds), "")
+
+
+def _as_configured(
+    config: Config, summary: Mapping[str, Any], verdict: str, reason: str
+) -> Learned:
+    """Go on with the configured optics, and say why."""
+    finding = of.OPTICS_AS_CONFIGURED({"verdict": verdict, "reason": reason})
+    return Learned(config, {**summary, "calibrated": False, "reason": reason}, (finding,))
 
 
 def adopted(
@@ -547,14 +541,12 @@ def adopted(
     """Use what was learned, where it may be used, and say so."""
     learned, why = accepted(found, config)
     if learned is None:
-        summary = {**tested, **_told(found), "calibrated": False, "reason": why}
-        said = OPTICS_AS_CONFIGURED({"verdict": verdict, "reason": why})
-        return Learned(config, summary, (said,))
+        return _as_configured(config, {**tested, **_told(found)}, verdict, why)
     if learned.optics.reference_phase_deg != found.config.optics.reference_phase_deg:
         found = found.with_phase(learned.optics.reference_phase_deg, _turned(config))
-    said = OPTICS_LEARNED({"headline": found.headline(picture_of)})
-    values = [found.value(name) for name in found.names]
-    errors = _with_errors(found.names, values, found.covariance, learned.optics.field_px)
+    said = of.OPTICS_LEARNED({"headline": found.headline(picture_of)})
+    values = {name: found.value(name) for name in found.names}
+    errors = _with_errors(values, found.covariance, learned.optics.field_px)
     summary = {**tested, **_told(found), **errors, "calibrated": True}
     return Learned(learned, summary, (said, *found.notes))
 
@@ -564,7 +556,7 @@ def _turned(config: Config) -> Finding:
     line = config.calibration
     dark = line is not None and line.gradient_per_kda < 0
     expected, found = ("darken", "brighten") if dark else ("brighten", "darken")
-    return TURNED_PHASE({"expected": expected, "found": found})
+    return of.TURNED_PHASE({"expected": expected, "found": found})
 
 
 def calibrate_movie(
@@ -583,23 +575,19 @@ def calibrate_movie(
     refuse_uncalibratable(config)
     steps = LIGHT_STEPS if focus_step_nm is None else SCAN_STEPS
     ready = calibrated(movie, config, steps, report=printing(notify))
-    movie, config, camera = ready.steady, ready.config, ready.camera
+    config = ready.config
     with threads(config.compute.workers) as pool:
+        recording = Recording(ready.steady, config, ready.camera, pool, ready.opening)
         progress("particles", 0, 1)
         if focus_step_nm is not None:
-            images = scan_particle_images(movie, config, camera)
+            images = scan_particle_images(recording)
             seen = Collected(config, images, focus_step_nm=focus_step_nm)
+            origin = recording.origin("scan of the focus")
         else:
-            images, others = bright_particle_images(movie, config, camera, pool, ready.opening)
-            seen = Collected(config, images, others)
+            seen = Collected(config, *bright_particle_images(recording))
+            origin = recording.origin()
         progress("particles", 1, 1)
-        origin = {
-            "movie": movie.path.name,
-            "sha256": movie.sha256(),
-            "kind": kind_of(config) if focus_step_nm is None else "scan of the focus",
-            "version": version("iscat-analysis"),
-        }
-        found = learned_from(seen, movie, config, camera, groups, origin, pool)
+        found = learned_from(seen, recording, groups, origin)
     return replace(found, config=ready.with_frames_asked(found.config))
 
 
@@ -615,41 +603,31 @@ def _check_step(step_nm: float, frames: int) -> None:
 
 
 def learned_from(
-    seen: Collected,
-    movie: Stack,
-    config: Config,
-    camera: Camera,
-    groups: Sequence[str],
-    origin: Mapping[str, str],
-    pool: ThreadPoolExecutor,
+    seen: Collected, recording: Recording, groups: Sequence[str], origin: Mapping[str, str]
 ) -> OpticsCalibration:
     """Learn the optics from particles that stand alone, or where these do not suffice from all."""
-    scan, way = seen.focus_step_nm is not None, background_mode(config)
-    crowded = way == "fixed" and not scan
+    config, pool, scan = recording.config, recording.pool, seen.focus_step_nm is not None
+    crowded = background_mode(config) == "fixed" and not scan
     if not crowded or len(seen.images) >= LEAST_IMAGES:
         asked = not scan and not heights_free(config) and set(groups) == set(FREE)
-        view = FieldOfView.of(movie, config, in_time=way == "sliding") if asked else None
+        view = FieldOfView.of(recording.movie, config) if asked else None
         found = learn(StandingAlone(seen, pool, view), config, groups, origin, pool.map).outcome
         if found.accepted or not crowded:
             return found
-    field = WholeField(_summed(movie, config, camera), config, pool)
+    field = WholeField(recording.summed(), config, pool)
     return learn(field, config, groups, origin, pool.map).outcome
 
 
-def _summed(movie: Stack, config: Config, camera: Camera) -> Windows:
-    """Sum the frames before and after particles bound."""
-    return measured_windows(movie, config, camera, *frame_ranges(movie, config))
-
-
-def noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
+def noise_differs(recording: Recording) -> bool:
     """Tell whether the first frames repeat each other, or have not the noise of p-values."""
+    movie, config, camera = recording.movie, recording.config, recording.camera
     first, last = config.background.recorded or config.fit.frames or (0, movie.shape[0])
     counts = movie.read(first, min(last, first + SPECTRUM_FRAMES, movie.shape[0]))
     light, repeats = measure_frames(counts, camera)
-    stuck = background_mode(config) != "sliding" and repeats.mean() > _STUCK
-    follows = config.background.follows_pattern if background_mode(config) == "sliding" else None
+    slides = background_mode(config) == "sliding"
+    follows = config.background.follows_pattern if slides else None
     noise = judge_counts(counts[well_lit(light) & ~repeats], camera, follows=follows)
-    return bool(stuck or noise.differs)
+    return bool((not slides and repeats.mean() > _STUCK) or noise.differs)
 
 
 def _verdict(tested: Tested | None) -> str:
@@ -702,11 +680,8 @@ def wrong_sign(config: Config) -> WrongSign | None:
     """Tell whether the configured optics give contrast the sign that the calibration has."""
     if config.calibration is None or config.optics.psf != "model":
         return None
-    try:
+    with suppress(ContrastError):
         forward_model(config, 1000.0)
-    except ContrastError:
-        pass
-    else:
         return None
     line = config.calibration.gradient_per_kda
     foci = sorted({*_FOCI_NM, config.optics.focus_nm})
@@ -719,10 +694,9 @@ def wrong_sign(config: Config) -> WrongSign | None:
     if share < 0.3:
         they = f"have next to no contrast ({share:.0%} of that at {most:g}), and what they have is"
     shown, expected = ("bright", "dark") if here > 0 else ("dark", "bright")
-    finding = WRONG_SIGN(
-        {"focus_nm": config.optics.focus_nm, "shown": f"{they} {shown}", "gradient_per_kda": line,
-         "expected": expected}
-    )  # fmt: skip
+    values = {"focus_nm": config.optics.focus_nm, "gradient_per_kda": line}
+    said = {"shown": f"{they} {shown}", "expected": expected}
+    finding = of.WRONG_SIGN({**values, **said})
     # of the largest contrast, which a focus to begin with has
     fair = [f for f in foci if contrast[f] * line > 0 and abs(contrast[f] / contrast[most]) > 0.2]
     starts = [focus for focus in fair if focus % 100.0 == 0]  # foci to begin with
@@ -738,36 +712,33 @@ def learn_sign(
     opening: NoiseSurvey | None = None,
 ) -> Learned:
     """Learn the optics of a movie whose configured focus has the wrong sign, or its focus alone."""
-    config = wrong.config
-    reason = why_not(config)
-    if reason:
+    config, optics = wrong.config, wrong.config.optics
+    if reason := why_not(config):
         raise wrong.error(f"the optics are not learned {reason}")
     if config.fit.mode == "track":
         raise wrong.error(
             "no track can be followed with it, from which the optics would be learned"
         )
-    if config.optics.calibrate == "never" or (
-        config.optics.calibrate == "auto" and config.optics.file is not None
-    ):
-        by = "file" if config.optics.calibrate == "auto" else "calibrate"
-        value = getattr(config.optics, by)
+    by = "file" if optics.calibrate == "auto" and optics.file is not None else "calibrate"
+    if by == "file" or optics.calibrate == "never":
+        value = getattr(optics, by)
         raise wrong.error(f'by optics.{by} = "{value}" the optics are not learned from the movie')
     notify("learning the optics from the particles of the movie, which may take minutes…")
     with threads(config.compute.workers) as pool:
+        recording = Recording(movie, config, camera, pool, opening)
         try:
-            if noise_differs(movie, config, camera):
+            if noise_differs(recording):
                 raise DataError("the movie does not tell another: " + NOISE)
             if heights_free(config):
-                seen = _begun(movie, wrong, camera, pool)
+                seen = _begun(recording, wrong.starts)
             else:
-                images, others = bright_particle_images(movie, config, camera, pool, opening)
-                seen = Collected(config, images, others)
+                seen = Collected(config, *bright_particle_images(recording))
             if not seen.images:
                 raise DataError(none_bright(movie.name))
-            median, _ = median_p(list(seen.images), config, seen.others, pool.map)
+            median, _ = median_p(seen.images, config, seen.others, pool.map)
             if median >= REJECTED_P:
                 raise DataError("with it the optics describe the particles of the movie")
-            found = _found(movie, seen, wrong, camera, pool)
+            found = _found(recording, seen)
         except DataError as error:
             raise wrong.error(str(error)) from error
     tested = {"tested": len(seen.images), "median_p": median}
@@ -775,51 +746,45 @@ def learn_sign(
     return learned._replace(findings=(wrong.finding, *learned.findings))
 
 
-def _begun(movie: Stack, wrong: WrongSign, camera: Camera, pool: ThreadPoolExecutor) -> Collected:
+def _begun(recording: Recording, starts: Sequence[Config]) -> Collected:
     """Fit the field with each focus of the right sign, and take what describes most particles."""
-    config = wrong.config
-    windows = measured_windows(movie, config, camera, *frame_ranges(movie, config))
-    best: tuple[float, Collected] | None = None
-    for start in wrong.starts:
-        images, others = seen_in_field(windows, start, pool)
-        if not images:
-            continue
-        model = microscopes(start, max(map(reach_nm, images)))(settings_of(start))
-        chi2 = float(np.median([goodness(image, model)[0] for image in images]))
-        if best is None or chi2 < best[0]:
-            best = chi2, Collected(config, images, others, settings_of(start))
-    return best[1] if best is not None else Collected(config, ())
+    windows, best = recording.summed(), (math.inf, Collected(recording.config, ()))
+    for start in starts:
+        images, others = seen_in_field(windows, start, recording.pool)
+        if images:
+            settings = settings_of(start)
+            model = microscopes(start, max(map(reach_nm, images)))(settings)
+            chi2 = float(np.median([goodness(image, model)[0] for image in images]))
+            seen = Collected(recording.config, images, others, settings)
+            best = min(best, (chi2, seen), key=lambda each: each[0])
+    return best[1]
 
 
-def _found(
-    movie: Stack, seen: Collected, wrong: WrongSign, camera: Camera, pool: ThreadPoolExecutor
-) -> OpticsCalibration:
+def _found(recording: Recording, seen: Collected) -> OpticsCalibration:
     """Measure the focus alone, or where that does not describe the particles all of the optics."""
-    config, origin = wrong.config, {"movie": movie.name}
-    found = fit_optics(seen, ("focus",), origin, pool.map)
-    focus = float(str(found.measured.settings["focus_nm"]))
+    config, mapper = recording.config, recording.pool.map
+    origin = {"movie": recording.movie.name}
+    found = fit_optics(seen, ("focus",), origin, mapper)
+    focus = found.value("focus_nm")
     if found.accepted:
         learned, _ = with_sign(found.config)
-        if learned is None or _phase(learned) != _phase(config):
+        phase = config.optics.reference_phase_deg
+        if learned is None or learned.optics.reference_phase_deg != phase:
             raise DataError(f"by the movie the focus is {focus:.0f} nm, which has that sign too")
         return found
-    if heights_free(config):
+    free = heights_free(config)
+    if free:
         near = replace(seen, near=found.measured.settings)
-        every = fit_optics(near, tuple(FREE), origin, pool.map)
+        every = fit_optics(near, tuple(FREE), origin, mapper)
     else:
-        every = learned_from(seen, movie, config, camera, tuple(FREE), origin, pool)
+        every = learned_from(seen, recording, tuple(FREE), origin)
     if accepted(every, config)[0] is not None:
         return every
-    chi2 = misfit_of(found)
-    more = "" if heights_free(config) else ", as where more than the focus is wrong"
+    more = "" if free else ", as where more than the focus is wrong"
     raise DataError(
         f"of the foci tried {focus:.0f} nm describes the brightest particles best, but not well "
-        f"(reduced chi2 {chi2:.3g}){more}"
+        f"(reduced chi2 {misfit_of(found):.3g}){more}"
     )
-
-
-def _phase(config: Config) -> float:
-    return config.optics.reference_phase_deg
 
 
 def _at(config: Config, focus_nm: float) -> Config:

@@ -17,6 +17,7 @@ import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Protocol
 
 import numpy as np
@@ -32,6 +33,7 @@ from iscat_analysis.instrument.joint_fit import Neighbours, maximise
 from iscat_analysis.instrument.measure import FOCUS_STEP_NM, TWIN_GAP, Measured, OpticsSearch
 from iscat_analysis.instrument.particle_image import (
     Collected,
+    Images,
     ParticleImage,
     goodness,
     microscopes,
@@ -99,13 +101,9 @@ def fit_optics(
     # of pictures that were not fitted, from which no other is looked for
     if not free or seen.near is not None or (found.accepted and misfit_of(found) < 1.2):
         return found
-    begun = _likeliest(start, groups, mapper)
-    other = _fitted(
-        replace(seen, images=begun.images, others=begun.others, near=begun.settings),
-        groups,
-        origin,
-        mapper,
-    )
+    begun = _likeliest(start, _search(start, groups, mapper))
+    near = replace(seen, images=begun.images, others=begun.others, near=begun.settings)
+    other = _fitted(near, groups, origin, mapper)
     return min(found, other, key=lambda one: (not one.accepted, misfit_of(one)))
 
 
@@ -123,42 +121,38 @@ def misfit_of(found: OpticsCalibration) -> float:
     return float(found.measured.judgement.chi2_reduced.mean())
 
 
-def _fitted(
-    seen: Collected, groups: Sequence[str], origin: Mapping[str, str], mapper: Mapper
-) -> OpticsCalibration:
-    """Measure the microscope and put the result together."""
+def _search(seen: Collected, groups: Sequence[str], mapper: Mapper) -> OpticsSearch:
+    """Set up the measurement of the microscope."""
     config, images = seen.config, seen.images
-    if not images:
-        raise DataError(none_bright(origin["movie"]))
     configured = settings_of(config)
     limits = optics_limits(config.optics.n_immersion, config.optics.n_glass)
     if seen.focus_step_nm is not None:
         configured[FOCUS_STEP] = seen.focus_step_nm
         low, high = sorted(factor * seen.focus_step_nm for factor in STEP_FACTORS)
         limits[FOCUS_STEP] = (low, high)
-    near = seen.near or {}
-    configured |= {name: 0.0 for name in (*MOVES, *FIELD) if name in near}
-    build = microscopes(config, max(map(reach_nm, images)))
-    focus = config.optics.focus_nm
-    search = OpticsSearch(
-        configured,
-        build,
-        groups,
-        limits,
-        prior_of(config, configured),
-        side=int(math.copysign(1, focus)) if focus else 0,
-        others=seen.others,
-        build_wide=rings_of(config, images[0]),
-        known=seen.near,
-        mapper=mapper,
+    configured |= {name: 0.0 for name in (*MOVES, *FIELD) if name in (seen.near or {})}
+    build, wide = microscopes(config, max(map(reach_nm, images))), rings_of(config, images[0])
+    prior, focus = prior_of(config, configured), config.optics.focus_nm
+    side = int(math.copysign(1, focus)) if focus else 0
+    return OpticsSearch(
+        configured, build, groups, limits, prior, side, seen.others, wide, seen.near, mapper
     )
-    measured = search.run(images)
+
+
+def _fitted(
+    seen: Collected, groups: Sequence[str], origin: Mapping[str, str], mapper: Mapper
+) -> OpticsCalibration:
+    """Measure the microscope and put the result together."""
+    if not seen.images:
+        raise DataError(none_bright(origin["movie"]))
+    search = _search(seen, groups, mapper)
+    measured = search.run(seen.images)
     if seen.refusal:
         measured = replace(measured, refusals=(*measured.refusals, seen.refusal))
     estimate = measured.estimate
-    pictures = make_pictures(estimate.images, build, estimate.values)
-    notes = _on_the_pixel(search, config, measured)
-    return make_result(config, configured, measured, pictures, origin, notes)
+    pictures = make_pictures(estimate.images, search.build, estimate.values)
+    notes = _on_the_pixel(search, seen.config, measured)
+    return make_result(seen.config, search.configured, measured, pictures, origin, notes)
 
 
 def _on_the_pixel(search: OpticsSearch, config: Config, measured: Measured) -> tuple[Finding, ...]:
@@ -180,25 +174,19 @@ def _on_the_pixel(search: OpticsSearch, config: Config, measured: Measured) -> t
     if abs(apart) < max(0.02, _ODD_SIGMAS * math.sqrt(estimate.covariance[k, k])):
         return ()
     most = (values["na"] / engraved) ** 2  # apertures change by half of what pixels do, or more
-    build = microscopes(config, max(1.0, most) * max(map(reach_nm, estimate.images)))
+    reach = max(1.0, most) * max(map(reach_nm, estimate.images))
+    wider = replace(search, build=microscopes(config, reach))
+    names = [name for name in estimate.names if name != "na"]
 
     def misfit(factor: float) -> float:
-        fit = maximise(
-            [image.stretched(factor) for image in estimate.images],
-            build,
-            {**values, "na": engraved},
-            [name for name in estimate.names if name != "na"],
-            prior=search.prior, limits=search.limits, passes=_OPTICS_PASSES, mapper=search.mapper,
-        )  # fmt: skip
+        stretched = [image.stretched(factor) for image in estimate.images]
+        fit = wider.fit(stretched, {**values, "na": engraved}, names, _OPTICS_PASSES)
         return estimate.log_likelihood - fit.log_likelihood
 
-    found = minimize_scalar(
-        # to which the size of pixels is looked for, over that size
-        misfit,
-        bounds=sorted((1.0, most)),
-        method="bounded",
-        options={"xatol": 1e-3},
-    )
+    # to which the size of pixels is looked for, over that size
+    options = {"xatol": 1e-3}
+    ends = sorted((1.0, most))
+    found = minimize_scalar(misfit, bounds=ends, method="bounded", options=options)
     if found.fun > TWIN_GAP:
         return ()
     sizes = {"pixel_nm": float(found.x) * pixel, "configured_nm": pixel}
@@ -210,106 +198,82 @@ class _Begun:
     """A microscope, and all particles at the heights that suit it best."""
 
     settings: Settings
-    images: list[ParticleImage]
-    others: list[ParticleImage]
+    images: Images
+    others: Images
     misfit: float
 
 
-def _likeliest(seen: Collected, groups: Sequence[str], mapper: Mapper) -> _Begun:
+def _likeliest(seen: Collected, search: OpticsSearch) -> _Begun:
     """Look for the microscope to begin with around the one that is near.
 
     The foci and lights that suit the pictures best are followed for some rounds of optics, and of
     heights and rings in them.  Where particles are at one height this is done on the average of
     their pictures.
     """
-    config, known = seen.config, dict(seen.near or {})
-    images, others = seen.images, seen.others
-    optics = config.optics
-    limits = optics_limits(optics.n_immersion, optics.n_glass)
-    build = microscopes(config, max(map(reach_nm, images)))
-    build_wide = rings_of(config, images[0])
+    known, groups = dict(seen.near or {}), search.free
+    build_wide = rings_of(seen.config, seen.images[0])
     lights = ("linear", "circular") if "polarization" in groups else (known["polarization"],)
     focus_moves = _FOCUS_MOVES_NM if "focus" in groups else (0.0,)
     # a focus and heights that are one fringe off describe the pictures nearly as well
-    clear = 1 + _CLEAR * math.sqrt(2 / math.prod(images[0].grid.shape))
+    clear = 1 + _CLEAR * math.sqrt(2 / math.prod(seen.images[0].grid.shape))
 
-    def placed(
-        settings: Settings,
-        some: Sequence[ParticleImage],
-        around: Sequence[ParticleImage],
-        moved: float = 0.0,
-    ) -> _Begun:
-        model, wide = build(settings), build_wide(settings)
+    def placed(settings: Settings, some: Images, around: Images, moved: float = 0.0) -> _Begun:
+        model, wide = search.build(settings), build_wide(settings)
         fringe = model.fringe_nm
         anywhere = [moved + fringe * k for k in (-1.0, -0.5, 0.0, 0.5, 1.0)]
-
-        def best(
-            few: Sequence[ParticleImage], shifts: Sequence[float]
-        ) -> list[tuple[float, ParticleImage]]:
-            return _best_heights(few, shifts, model, settings, mapper)
-
-        near = [image for _, image in best(around, anywhere)] if around else []
+        near = _best_heights(around, anywhere, model, settings, search.mapper)[0]
         for _ in range(_TURNS if near else 0):  # each among all, whose rings other heights change
-            among = Neighbours(tuple(near), wide).around(near, mapper)
-            near = [image for _, image in best(among, [-fringe, 0.0, fringe])]
-        found = best(Neighbours(tuple(near), wide).around(some, mapper), anywhere)
-        misfit = float(np.median([chi2 for chi2, _ in found]))
-        return _Begun(settings, [image for _, image in found], near, misfit)
+            among = Neighbours(near, wide).around(near, search.mapper)
+            shifts = [-fringe, 0.0, fringe]
+            near = _best_heights(among, shifts, model, settings, search.mapper)[0]
+        among = Neighbours(near, wide).around(some, search.mapper)
+        images, chi2 = _best_heights(among, anywhere, model, settings, search.mapper)
+        return _Begun(settings, images, near, float(np.median(chi2)))
 
     def better(one: _Begun) -> _Begun:
         names = free_names(groups, one.settings, FREE["zernike"])
-        fit = maximise(
-            one.images, build, one.settings, names, prior=prior_of(config), limits=limits,
-            passes=_OPTICS_PASSES, mapper=mapper,
-        )  # fmt: skip
+        fit = search.fit(one.images, one.settings, names, _OPTICS_PASSES)
         return placed(fit.values, fit.images, one.others)
 
-    tried = [
-        placed(
-            {**known, "polarization": light, "focus_nm": known["focus_nm"] + moved},
-            images, others, moved,
-        )
-        for light in lights for moved in focus_moves
-    ]  # fmt: skip
+    tried = []
+    for light, moved in product(lights, focus_moves):
+        there = {**known, "polarization": light, "focus_nm": known["focus_nm"] + moved}
+        tried.append(placed(there, seen.images, seen.others, moved))
     tried.sort(key=lambda begun: begun.misfit)
     first = next(begun for begun in tried if begun.settings["focus_nm"] == known["focus_nm"])
     leaders = [first, *(begun for begun in tried[:_LEADERS] if begun is not first)]
-    followed: list[_Begun] = []
     for begun in leaders:
         for _ in range(_FOLLOWED):
             begun = better(begun)
-            followed.append(begun)
+            tried.append(begun)
             if begun.misfit < clear:
                 return begun
-    return min([*tried, *followed], key=lambda begun: begun.misfit)
+    return min(tried, key=lambda begun: begun.misfit)
 
 
 def _best_heights(
-    images: Sequence[ParticleImage],
+    images: Images,
     shifts_nm: Sequence[float],
     model: ForwardModel,
     settings: Settings,
     mapper: Mapper,
-) -> list[tuple[float, ParticleImage]]:
-    """Fit every image from several heights; give the reduced χ² of the best fit, and that.
+) -> tuple[Images, list[float]]:
+    """Fit every image from several heights; give the best fits, and their reduced χ².
 
     Half a fringe away a particle of the other sign looks much the same, but none leaves here: a fit
     with the sign that the mass had is preferred.
     """
-
-    def build(_: Settings) -> ForwardModel:
-        return model
-
     found: list[list[tuple[bool, float, ParticleImage]]] = [[] for _ in images]
-    for shift in shifts_nm:
+    for shift in shifts_nm if images else ():
         moved = [image.raised(shift) for image in images]
-        begun = with_masses(moved, build, settings)
+        begun = with_masses(moved, lambda _: model, settings)
         # of a fit from one of several heights
-        fits = maximise(begun, build, settings, (), passes=12, mapper=mapper).images
+        fits = maximise(begun, lambda _: model, settings, (), passes=12, mapper=mapper).images
         for image, fit, of_it in zip(images, fits, found, strict=True):
             turned = image.mass_kda * fit.mass_kda < 0
             of_it.append((turned, goodness(fit, model)[0], fit))
-    return [min(fits, key=lambda fit: fit[:2])[1:] for fits in found]
+    best = [min(fits, key=lambda fit: fit[:2]) for fits in found]
+    return [fit for *_, fit in best], [chi2 for _, chi2, _ in best]
 
 
 SETTLED = 1.0
@@ -346,7 +310,7 @@ def learn(
         found = fit_optics(seen, groups, origin, mapper)
         learned, reason = accepted(found, config)
         ahead = learned or with_sign(with_settings(config, found.measured.settings))[0]
-        rounds = rounds.with_one(Round(seen, described, found, learned, ahead, reason))
+        rounds = Rounds((*rounds.all, Round(seen, described, found, learned, ahead, reason)))
     return rounds
 
 
@@ -411,17 +375,12 @@ class Rounds:
 
     all: tuple[Round, ...] = ()
 
-    def with_one(self, last: Round) -> Rounds:
-        """Add a round."""
-        return Rounds((*self.all, last))
-
     @property
     def best(self) -> Round | None:
         """The last one whose optics may be used, of pictures that were found with right ones."""
         if self.all and self.all[-1].seen.refusal:
             return None
-        good = (one for one in reversed(self.all) if one.learned is not None and one.described)
-        return next(good, None)
+        return next((one for one in self.all[::-1] if one.learned and one.described), None)
 
     @property
     def outcome(self) -> OpticsCalibration:
@@ -442,9 +401,9 @@ class Rounds:
         if not (then.same_kind and now.same_kind):
             return None
         names = [name for name in now.found.names if name in then.found.names]
-        own = [now.found.names.index(name) for name in names]
+        own, old = ([each.found.names.index(name) for name in names] for each in (now, then))
         moved = change_of(then.before, now.before, names)
-        changed = now.step[own] - then.step[[then.found.names.index(name) for name in names]]
+        changed = now.step[own] - then.step[old]
         weight = np.linalg.pinv(now.found.covariance[np.ix_(own, own)], hermitian=True)
         square = float(moved @ weight @ moved)
         if square == 0:
@@ -472,13 +431,12 @@ class Rounds:
         last = self.all[-1]
         if self.share is None or last.ahead is None:
             return last.ahead
-        values = settings_of(last.ahead)
-        optics = last.ahead.optics
+        values, optics = settings_of(last.ahead), last.ahead.optics
         limits = optics_limits(optics.n_immersion, optics.n_glass)
         ahead = min(self.share / (1 - self.share), _FARTHEST) * last.step
         for name, change in zip(last.found.names, ahead.tolist(), strict=True):
-            low, high = limits.get(name, (-np.inf, np.inf))
-            values[name] = float(min(max(values[name] + change, low), high))
+            ends = limits.get(name, (-np.inf, np.inf))
+            values[name] = float(np.clip(values[name] + change, *ends))
         return with_settings(last.ahead, values)
 
     def error_of(self, taken: Round) -> FloatArray:
@@ -580,7 +538,7 @@ class WholeField:
 
 def seen_in_field(
     windows: Windows, config: Config, pool: ThreadPoolExecutor
-) -> tuple[list[ParticleImage], list[ParticleImage]]:
+) -> tuple[Images, Images]:
     """Fit the field, and cut out the particles that are farthest from others."""
     free = heights_free(config)
     fit = config.fit.model_copy(update={"mode": "joint" if free else "mass"})

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress, product
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from iscat_analysis.instrument.particle_image import (
     FARTHEST_CENTRE_PX,
     UNIT_KDA,
     Build,
+    Images,
     ParticleImage,
     average_particle_images,
     best_amplitudes,
@@ -89,7 +91,7 @@ def _quadratures(model: Any, image: ParticleImage) -> tuple[FloatArray, FloatArr
 
 
 def search_starts(
-    averages: Sequence[ParticleImage],
+    averages: Images,
     build: Build,
     candidates: Sequence[Mapping[str, Any]],
     *,
@@ -172,42 +174,6 @@ def _best_phase(
     return np.abs(tried), turns + np.pi * (tried < 0), gained
 
 
-def turned_starts(
-    averages: Sequence[ParticleImage], build: Build, starts: Sequence[Start]
-) -> tuple[Start, ...]:
-    """Turn the linear light of every start to the direction that explains most."""
-    out = []
-    for start in starts:
-        if start.values["polarization"] == "linear":
-            first = start.values["polarization_deg"]
-            turns = [{**start.values, "polarization_deg": first + t} for t in _DIRECTIONS_DEG]
-            (best,) = search_starts(averages, build, turns, most=1)
-            start = max(start, best, key=lambda each: each.explained)
-        out.append(start)
-    return tuple(out)
-
-
-_STARTS = 2  # microscopes that are refined, per state
-
-
-_FIRST_PASSES, _MORE_PASSES = 6, 10  # of all starts, and of those that lead then
-
-
-_LEADERS = 2  # beside the best of every state
-
-
-_HOPELESS = 0.03  # share of the log-likelihood by which a state lags that is given up
-
-
-_MASKS_NA = (0.35, 0.65)
-
-
-_FINER_MASKS_NA = (0.35, 0.5, 0.65, 0.8, 1.0)
-
-
-_FINER_TRANSMITS = (0.3, 0.75)
-
-
 def same_state(one: Estimate, other: Estimate) -> bool:
     """Tell whether two microscopes have the same polarisation, and both a mask or none."""
     return _state(one.values) == _state(other.values)
@@ -215,173 +181,6 @@ def same_state(one: Estimate, other: Estimate) -> bool:
 
 def _state(values: Settings) -> tuple[str, bool]:
     return str(values["polarization"]), bool(values["mask_na"] > 0)
-
-
-@dataclass(frozen=True)
-class StateSearch:
-    """Search for the kind of microscope; `run` does it.
-
-    Where the search for the microscope begins: every focus, on the average of all pictures.
-
-    The pictures are registered on each other, with the sign of each, and averaged; no model takes
-    part in that.  For one focus the contrast of a weak particle is linear in the cosine and the
-    sine of the reference phase, so that the phase and the amplitude that fit the average best
-    follow from a 2 × 2 system at every shift of the picture.  Of a strong particle one sees the
-    scattered light itself as well, with the square of the amplitude: the best amplitude is then the
-    root of a cubic equation for every phase.
-    """
-
-    configured: Settings
-    build: Build
-    free: tuple[str, ...]
-    limits: Mapping[str, tuple[float, float]]
-    prior: Prior
-    mapper: Mapper = map
-
-    def run(self, averages: Sequence[ParticleImage]) -> list[Estimate]:
-        """Refine the most promising microscopes."""
-        found = list(self.mapper(lambda state: self._begin(averages, state), self.states()))
-        begun = [start for starts in found for start in starts if self._promising(start, found)]
-        refined = self._refine(averages, begun)
-        hidden = self._hidden_masks(averages, refined)
-        refined += self._refine(averages, hidden, refined) if hidden else []
-        return sorted(refined, key=lambda e: -e.log_posterior)
-
-    def states(self) -> list[list[dict[str, Any]]]:
-        """Give the settings to start from, those of one state together."""
-        now = dict(self.configured)
-        lights = ["linear", "circular"] if "polarization" in self.free else [now["polarization"]]
-        masks: list[list[dict[str, Any]]] = [[{}]]
-        if "mask" in self.free:
-            # where no attenuation is configured
-            dims = now["attenuation"] if now["attenuation"] < 0.9 else 0.3
-            edges = sorted({*_MASKS_NA, *([now["mask_na"]] if now["mask_na"] else [])})
-            masks = [
-                [{"mask_na": 0.0, "attenuation": now["attenuation"]}],
-                [{"mask_na": edge, "attenuation": dims} for edge in edges],
-            ]
-        foci = [now["focus_nm"]]
-        if "focus" in self.free:
-            # how far from the configured focus the search goes
-            steps = math.ceil(1000.0 / FOCUS_STEP_NM)
-            foci = [now["focus_nm"] + FOCUS_STEP_NM * i for i in range(-steps, steps + 1)]
-        return [
-            [
-                {**now, **mask, "polarization": light, "focus_nm": focus}
-                for mask in kind
-                for focus in foci
-            ]
-            for light in lights
-            for kind in masks
-        ]
-
-    def _begin(
-        self,
-        averages: Sequence[ParticleImage],
-        candidates: Sequence[Mapping[str, Any]],
-        most: int = _STARTS,
-    ) -> tuple[Start, ...]:
-        starts = search_starts(averages, self.build, candidates, most=most, prior=self.prior)
-        if "polarization" in self.free:
-            starts = turned_starts(averages, self.build, starts)
-        return starts if "phase" in self.free else tuple(map(self._phased, starts))
-
-    def _promising(self, start: Start, found: Sequence[Sequence[Start]]) -> bool:
-        """Whether a mask that is not configured explains more than the same light without one."""
-        if not start.values["mask_na"] or self.configured["mask_na"]:
-            return True
-        light = start.values["polarization"]
-        plain = [
-            other.explained
-            for others in found
-            for other in others
-            if other.values["polarization"] == light and not other.values["mask_na"]
-        ]
-        return start.explained > 1.01 * max(plain)  # times what the same light explains without one
-
-    def _phased(self, start: Start) -> Start:
-        """Put the configured reference phase back."""
-        phase = self.configured["reference_phase_deg"]
-        flipped = math.cos(math.radians(start.values["reference_phase_deg"] - phase)) < 0
-        mass = -start.mass_kda if flipped else start.mass_kda
-        return replace(start, values={**start.values, "reference_phase_deg": phase}, mass_kda=mass)
-
-    def _refine(
-        self,
-        averages: Sequence[ParticleImage],
-        begun: Sequence[Start],
-        known: Sequence[Estimate] = (),
-    ) -> list[Estimate]:
-        """Fit the averages from every start, and go on with those that lead after a few passes.
-
-        What is behind a known microscope of the same light is left out.
-        """
-
-        def first(start: Start) -> Estimate:
-            there = [
-                replace(a, x_nm=start.x_nm, y_nm=start.y_nm, mass_kda=start.mass_kda)
-                for a in averages
-            ]
-            return self._fit(there, start.values, _FIRST_PASSES)
-
-        def more(fit: Estimate) -> Estimate:
-            return fit if fit.converged else self._fit(fit.images, fit.values, _MORE_PASSES)
-
-        fits = sorted(self.mapper(first, begun), key=lambda e: -e.log_posterior)
-        fits = [
-            fit
-            for fit in fits
-            if not any(
-                fit.values["polarization"] == other.values["polarization"]
-                and fit.log_posterior < other.log_posterior
-                for other in known
-            )
-        ]
-        leading = [
-            fit
-            for rank, fit in enumerate(fits)
-            if rank < _LEADERS
-            or (
-                not any(same_state(fit, better) for better in fits[:rank])
-                and fit.log_posterior > (1 - _HOPELESS) * fits[0].log_posterior
-            )
-        ]
-        return list(self.mapper(more, leading))
-
-    def _fit(self, images: Sequence[ParticleImage], start: Settings, passes: int) -> Estimate:
-        names = free_names(self.free, start, PRIMARY + SECONDARY)
-        return maximise(
-            images, self.build, start, names,
-            # gain in log-likelihood that ends a search
-            prior=self.prior, limits=self.limits, tolerance=1.0, passes=passes,
-        )  # fmt: skip
-
-    def _hidden_masks(
-        self, averages: Sequence[ParticleImage], refined: Sequence[Estimate]
-    ) -> list[Start]:
-        """Begin with a mask in every refined pupil that has none."""
-        if "mask" not in self.free:
-            return []
-        top = max(fit.log_posterior for fit in refined)
-        plain = [
-            fit
-            for fit in refined
-            if not fit.values["mask_na"] and fit.log_posterior > (1 - _HOPELESS) * top
-        ]
-        begun = self.mapper(
-            lambda fit: self._begin(
-                averages,
-                [
-                    {**fit.values, "mask_na": edge, "attenuation": dim}
-                    for edge in _FINER_MASKS_NA
-                    for dim in _FINER_TRANSMITS
-                    if edge < fit.values["na"] - 0.1
-                ],
-                most=1,
-            ),
-            plain,
-        )
-        return [start for starts in begun for start in starts]
 
 
 HELD_OUT = 3
@@ -401,18 +200,13 @@ HELD_OUT_P = 1e-3
 """Below this chance the p-values of pictures that were not fitted are not uniform."""
 
 
-_PLACE = ("x_nm", "y_nm")
-
-
-_RUNG_PASSES = 12
-
-
-_CONTAMINATED_SHARE = 0.25  # more than this is the model's fault
-
-
-_TRIAL_PASSES = 12  # of a second microscope on all pictures
-
-
+_TRIAL_PASSES = 12  # of a second microscope on all pictures, and of one with fewer aberrations
+_FIRST_PASSES, _MORE_PASSES = 6, 10  # of all starts, and of those that lead then
+_LEADERS = 2  # beside the best of every state
+_HOPELESS = 0.03  # share of the log-likelihood by which a state lags that is given up
+_MASKS_NA = (0.35, 0.65)
+_FINER_MASKS_NA = (0.35, 0.5, 0.65, 0.8, 1.0)
+_FINER_TRANSMITS = (0.3, 0.75)
 _CLOSE = 0.01  # states whose average is explained this much worse are tried on all pictures
 
 
@@ -433,6 +227,20 @@ class Judgement:
     def pictures(self) -> str:
         """Say which pictures."""
         return "the fitted pictures" if self.fitted else "pictures that were not fitted"
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """What files hold of it."""
+        p_values, chi2 = self.p_values.tolist(), self.chi2_reduced.tolist()
+        return {"p_values": p_values, "chi2_reduced": chi2, "uniform_p": self.uniform_p}
+
+    @property
+    def complaint(self) -> str:
+        """Say that they do not agree."""
+        return (
+            f"the p-values of {self.p_values.size} of {self.pictures} are not uniform (p = "
+            f"{self.uniform_p:.1g}, mean reduced chi2 = {float(np.mean(self.chi2_reduced)):.3f})"
+        )
 
     @property
     def good(self) -> bool:
@@ -458,15 +266,12 @@ class Measured:
     undecided: tuple[str, ...]
     judgement: Judgement
     configured: Judgement
-    held_out: tuple[ParticleImage, ...]
     twin: Twin | None
     contaminated: int
     refusals: tuple[str, ...]
 
 
-def judge(
-    images: Sequence[ParticleImage], build: Build, settings: Settings, mapper: Mapper = map
-) -> Judgement:
+def judge(images: Images, build: Build, settings: Settings, mapper: Mapper = map) -> Judgement:
     """Judge fitted pictures one by one and all together."""
     from scipy.stats import kstest  # a second to load, for those who learn optics
 
@@ -481,20 +286,41 @@ def judge(
     return Judgement(p_values, chi2, float(kstest(p_values, "uniform").pvalue), left_over)
 
 
-def _fitted(images: Sequence[ParticleImage]) -> list[ParticleImage]:
-    """Give the pictures that are fitted: all where they are few."""
-    few = len(images) < LEAST_IMAGES
-    return [image for i, image in enumerate(images) if few or i % HELD_OUT != 1]
+def parted(images: Images) -> tuple[Images, Images]:
+    """Give the pictures that are fitted, all where they are few, and those that judge the fit."""
+    if len(images) < LEAST_IMAGES:
+        return list(images), []
+    fitted = [image for i, image in enumerate(images) if i % HELD_OUT != 1]
+    return fitted, list(images[1::HELD_OUT])
 
 
-def _held_out(images: Sequence[ParticleImage]) -> list[ParticleImage]:
-    """Give the pictures that are not."""
-    return list(images[1::HELD_OUT]) if len(images) >= LEAST_IMAGES else []
+def without_contaminated(
+    fitted: Images, held_out: Images, p_values: FloatArray
+) -> tuple[Images, Images]:
+    """Leave out the few pictures in which something else happened, if the others are fine.
+
+    Shapes: `p_values` (n,), of the pictures that were fitted and then of those that judge.
+    """
+    # a single picture with a smaller p-value, where most are fine, shows more than one particle
+    fine = p_values > 1e-4
+    if np.mean(~fine) > 0.25:  # the model's fault
+        return list(fitted), list(held_out)
+    number = len(fitted)
+    return list(compress(fitted, fine[:number])), list(compress(held_out, fine[number:]))
 
 
 @dataclass
 class OpticsSearch:
-    """One measurement of the microscope from pictures of particles; its steps in order of `run`."""
+    """One measurement of the microscope from pictures of particles; its steps in order of `run`.
+
+    Where no microscope is near, the search begins on the average of all pictures, with every focus.
+    The pictures are registered on each other, with the sign of each, and averaged; no model takes
+    part in that.  For one focus the contrast of a weak particle is linear in the cosine and the
+    sine of the reference phase, so that the phase and the amplitude that fit the average best
+    follow from a 2 × 2 system at every shift of the picture.  Of a strong particle one sees the
+    scattered light itself as well, with the square of the amplitude: the best amplitude is then the
+    root of a cubic equation for every phase.
+    """
 
     configured: Settings
     build: Build
@@ -506,7 +332,7 @@ class OpticsSearch:
     side: int = 0
     """Sign of the focus, where the configuration tells it."""
 
-    others: Sequence[ParticleImage] = ()
+    others: Images = ()
     """Particles whose rings are in the pictures."""
 
     build_wide: Build | None = None
@@ -518,7 +344,7 @@ class OpticsSearch:
     mapper: Mapper = map
 
     @one_thread_algebra()
-    def run(self, images: Sequence[ParticleImage]) -> Measured:
+    def run(self, images: Images) -> Measured:
         """Measure the microscope, the brightest pictures first."""
         images = sorted(images, key=lambda image: -image.snr)
         if self.known is None:
@@ -534,50 +360,166 @@ class OpticsSearch:
         best, twin = self._twin(best)
         best, held_out = self._cleared(best, held_out)
         best, held_out = self._signed(best, held_out)
-        judged = self._fit(held_out or best.images, best.values, ())
+        judged = self.fit(held_out or best.images, best.values, ())
         judgement = judge(judged.images, self.build, best.values, self.mapper)
         judgement = replace(judgement, fitted=not held_out)
-        nominal = self._fit(
-            with_masses(judged.images, self.build, self.configured), self.configured, ()
-        )
+        again = with_masses(judged.images, self.build, self.configured)
+        nominal = self.fit(again, self.configured, ())
         configured = judge(nominal.images, self.build, self.configured, self.mapper)
         worse = nominal.log_likelihood - judged.log_likelihood > WORSE_GAP
         images = (*best.images, *judged.images) if held_out else best.images
-        final = self._fit(images, best.values, best.names)
+        final = self.fit(images, best.values, best.names)
         refusals = self._refusals(final, judgement, twin, worse=worse)
+        # with the errors of what is not worth having, too, and what they add to all others
+        whole = self.fit(final.images, final.values, (*final.names, *dropped), passes=1)
         return Measured(
-            settings=final.values, estimate=self._with_dropped(final, dropped), dropped=dropped,
-            undecided=undecided, judgement=judgement, configured=configured,
-            held_out=judged.images, twin=twin, contaminated=contaminated, refusals=refusals,
+            final.values, replace(whole, converged=final.converged), dropped, undecided,
+            judgement, configured, twin, contaminated, refusals,
         )  # fmt: skip
 
-    def _with_dropped(self, final: Estimate, dropped: Sequence[str]) -> Estimate:
-        """Give the errors of what is not worth having, too, and what they add to all others."""
-        names = (*final.names, *dropped)
-        whole = self._fit(final.images, final.values, names, passes=1)
-        return replace(whole, converged=final.converged)
-
-    def _fit(
-        self,
-        images: Sequence[ParticleImage],
-        start: Settings,
-        names: Sequence[str],
-        passes: int = 40,
+    def fit(
+        self, images: Images, start: Settings, names: Sequence[str], passes: int = 40
     ) -> Estimate:
+        """Fit named parameters of the optics, and what is each picture's own."""
         return maximise(
             images, self.build, start, names,
             prior=self.prior, limits=self.limits, passes=passes, mapper=self.mapper,
         )  # fmt: skip
 
-    def _worth(self, fit: Estimate, held_out: Sequence[ParticleImage]) -> float:
+    def _states(self, averages: Images) -> list[Estimate]:
+        """Refine the most promising microscopes on the average pictures, the likeliest first."""
+        found = list(self.mapper(lambda state: self._begin(averages, state, 2), self._settings()))
+        begun = [start for starts in found for start in starts]
+        refined = self._refine(averages, [s for s in begun if self._promising(s, begun)])
+        hidden = self._hidden_masks(averages, refined)
+        refined += self._refine(averages, hidden, refined) if hidden else []
+        return sorted(refined, key=lambda e: -e.log_posterior)
+
+    def _settings(self) -> list[list[dict[str, Any]]]:
+        """Give the settings to start from, those of one state together."""
+        now = dict(self.configured)
+        lights = ["linear", "circular"] if "polarization" in self.free else [now["polarization"]]
+        masks: list[list[dict[str, Any]]] = [[{}]]
+        if "mask" in self.free:
+            # where no attenuation is configured
+            dims = now["attenuation"] if now["attenuation"] < 0.9 else 0.3
+            edges = sorted({*_MASKS_NA, *([now["mask_na"]] if now["mask_na"] else [])})
+            masks = [
+                [{"mask_na": 0.0, "attenuation": now["attenuation"]}],
+                [{"mask_na": edge, "attenuation": dims} for edge in edges],
+            ]
+        # how far from the configured focus the search goes
+        steps = math.ceil(1000.0 / FOCUS_STEP_NM) if "focus" in self.free else 0
+        foci = [now["focus_nm"] + FOCUS_STEP_NM * i for i in range(-steps, steps + 1)]
+        return [
+            [
+                {**now, **mask, "polarization": light, "focus_nm": focus}
+                for mask in kind
+                for focus in foci
+            ]
+            for light in lights
+            for kind in masks
+        ]
+
+    def _begin(
+        self, averages: Images, candidates: Sequence[Mapping[str, Any]], most: int
+    ) -> list[Start]:
+        """Choose starts, their linear light turned to the direction that explains most."""
+        out = []
+        for start in search_starts(averages, self.build, candidates, most=most, prior=self.prior):
+            values = start.values
+            if "polarization" in self.free and values["polarization"] == "linear":
+                first = values["polarization_deg"]
+                turns = [{**values, "polarization_deg": first + t} for t in _DIRECTIONS_DEG]
+                (best,) = search_starts(averages, self.build, turns, most=1)
+                start = max(start, best, key=lambda each: each.explained)
+            if "phase" not in self.free:  # the configured one is put back
+                phase = self.configured["reference_phase_deg"]
+                apart = start.values["reference_phase_deg"] - phase
+                mass = math.copysign(start.mass_kda, math.cos(math.radians(apart)))
+                values = {**start.values, "reference_phase_deg": phase}
+                start = replace(start, values=values, mass_kda=mass)
+            out.append(start)
+        return out
+
+    def _promising(self, start: Start, begun: Sequence[Start]) -> bool:
+        """Whether a mask that is not configured explains more than the same light without one."""
+        if not start.values["mask_na"] or self.configured["mask_na"]:
+            return True
+        light = start.values["polarization"]
+        plain = [
+            other.explained
+            for other in begun
+            if other.values["polarization"] == light and not other.values["mask_na"]
+        ]
+        return start.explained > 1.01 * max(plain)  # times what the same light explains without one
+
+    def _refine(
+        self, averages: Images, begun: Sequence[Start], known: Sequence[Estimate] = ()
+    ) -> list[Estimate]:
+        """Fit the averages from every start, and go on with those that lead after a few passes.
+
+        What is behind a known microscope of the same light is left out.
+        """
+
+        def fit(images: Images, values: Settings, passes: int) -> Estimate:
+            names = free_names(self.free, values, PRIMARY + SECONDARY)
+            # gain in log-likelihood that ends a search
+            return maximise(
+                images, self.build, values, names,
+                prior=self.prior, limits=self.limits, tolerance=1.0, passes=passes,
+            )  # fmt: skip
+
+        def first(start: Start) -> Estimate:
+            x, y, mass = start.x_nm, start.y_nm, start.mass_kda
+            there = [replace(one, x_nm=x, y_nm=y, mass_kda=mass) for one in averages]
+            return fit(there, start.values, _FIRST_PASSES)
+
+        def more(found: Estimate) -> Estimate:
+            return found if found.converged else fit(found.images, found.values, _MORE_PASSES)
+
+        def is_behind(found: Estimate) -> bool:
+            light = found.values["polarization"]
+            rivals = [other for other in known if other.values["polarization"] == light]
+            return any(found.log_posterior < other.log_posterior for other in rivals)
+
+        fits = sorted(self.mapper(first, begun), key=lambda e: -e.log_posterior)
+        fits = [found for found in fits if not is_behind(found)]
+        leading = [
+            found
+            for rank, found in enumerate(fits)
+            if rank < _LEADERS
+            or (
+                not any(same_state(found, better) for better in fits[:rank])
+                and found.log_posterior > (1 - _HOPELESS) * fits[0].log_posterior
+            )
+        ]
+        return list(self.mapper(more, leading))
+
+    def _hidden_masks(self, averages: Images, refined: Sequence[Estimate]) -> list[Start]:
+        """Begin with a mask in every refined pupil that has none."""
+        if "mask" not in self.free:
+            return []
+        least = (1 - _HOPELESS) * max(fit.log_posterior for fit in refined)
+
+        def begun(fit: Estimate) -> list[Start]:
+            masked = [
+                {**fit.values, "mask_na": edge, "attenuation": dim}
+                for edge, dim in product(_FINER_MASKS_NA, _FINER_TRANSMITS)
+                if edge < fit.values["na"] - 0.1
+            ]
+            return self._begin(averages, masked, 1)
+
+        plain = [f for f in refined if not f.values["mask_na"] and f.log_posterior > least]
+        return [start for starts in self.mapper(begun, plain) for start in starts]
+
+    def _worth(self, fit: Estimate, held_out: Images) -> float:
         """Say how well a microscope does, by pictures that were not fitted or by its evidence."""
         if not held_out:
             return fit.log_evidence
-        return self._fit(held_out, fit.values, ()).log_likelihood
+        return self.fit(held_out, fit.values, ()).log_likelihood
 
-    def _cleared(
-        self, best: Estimate, held_out: Sequence[ParticleImage]
-    ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
+    def _cleared(self, best: Estimate, held_out: Images) -> tuple[Estimate, Images]:
         """Put the rings of all neighbours into what is expected of every picture."""
         if not self.others or self.build_wide is None:
             return best, tuple(held_out)
@@ -585,81 +527,58 @@ class OpticsSearch:
         self.others = near.particles  # where they are is known the next time
         among = near.around((*best.images, *held_out), self.mapper)
         fitted, judged = among[: len(best.images)], among[len(best.images) :]
-        return self._fit(fitted, best.values, best.names), self._own(judged, best.values)
+        return self.fit(fitted, best.values, best.names), self._own(judged, best.values)
 
-    def _own(
-        self, images: Sequence[ParticleImage], settings: Settings
-    ) -> tuple[ParticleImage, ...]:
+    def _own(self, images: Images, values: Settings) -> Images:
         """Fit what is an image's own."""
-        return self._fit(images, settings, ()).images if images else ()
+        return self.fit(images, values, ()).images if images else ()
 
-    def _best_state(
-        self, averages: Sequence[ParticleImage], placed: Sequence[ParticleImage]
-    ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
+    def _best_state(self, averages: Images, placed: Images) -> tuple[Estimate, Images]:
         """Try every state on the average picture, the best ones on the pictures to be fitted.
 
         A mask of which the configuration knows nothing must earn its two parameters.
         The pictures that are not fitted come back with their places and masses.
         """
-        states = StateSearch(
-            self.configured, self.build, tuple(self.free), self.limits, self.prior, self.mapper
-        )
-        refined = states.run(averages)
+        refined = self._states(averages)
         top = refined[0].log_posterior
-        joint: list[tuple[float, Estimate, tuple[ParticleImage, ...]]] = []
+        joint: list[tuple[float, Estimate, Images]] = []
         tried: list[Estimate] = []
         for rough in refined:
             far = top - rough.log_posterior > max(_CLOSE * top, 2 * TWIN_GAP)
             if far or any(same_state(rough, other) for other in tried):
                 continue
-            x_nm, y_nm = (np.median([getattr(a, k) for a in rough.images]) for k in _PLACE)
-            images = with_masses(
-                [s.placed(s.x_nm + float(x_nm), s.y_nm + float(y_nm)) for s in placed],
-                self.build,
-                rough.values,
-            )
-            names = free_names(self.free, rough.values, FREE["zernike"])
             tried.append(rough)
-            fit = self._fit(_fitted(images), rough.values, names, _TRIAL_PASSES)
-            judged = _held_out(images)
+            x_nm, y_nm = np.median([(a.x_nm, a.y_nm) for a in rough.images], axis=0).tolist()
+            moved = [s.placed(s.x_nm + x_nm, s.y_nm + y_nm) for s in placed]
+            fitted, judged = parted(with_masses(moved, self.build, rough.values))
+            names = free_names(self.free, rough.values, FREE["zernike"])
+            fit = self.fit(fitted, rough.values, names, _TRIAL_PASSES)
             new_mask = fit.values["mask_na"] > 0 and not self.configured["mask_na"]
             earned = self._worth(fit, judged) - (TWIN_GAP if new_mask else 0.0)
             joint.append((earned, fit, self._own(judged, fit.values)))
         _, best, held_out = max(joint, key=lambda each: each[0])
         if not best.converged:
-            best = self._fit(best.images, best.values, best.names)
+            best = self.fit(best.images, best.values, best.names)
         return best, held_out
 
-    def _of_known_kind(
-        self, images: Sequence[ParticleImage], known: Settings
-    ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
+    def _of_known_kind(self, images: Images, known: Settings) -> tuple[Estimate, Images]:
         """Go on from a microscope that is near."""
         names = free_names(self.free, known, FREE["zernike"])
-        fitted = _fitted(images)
-        best = self._fit(fitted, known, names)
+        fitted, judged = parted(images)
+        best = self.fit(fitted, known, names)
         # focus and phase move all heights, those of pictures that were not fitted to other fringes
         rise = np.median([s.z_nm - was.z_nm for s, was in zip(best.images, fitted, strict=True)])
-        held_out = [s.raised(float(rise)) for s in _held_out(images)]
-        return best, self._own(held_out, best.values)
+        return best, self._own([s.raised(float(rise)) for s in judged], best.values)
 
-    def _uncontaminated(
-        self, best: Estimate, held_out: Sequence[ParticleImage]
-    ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
+    def _uncontaminated(self, best: Estimate, held_out: Images) -> tuple[Estimate, Images]:
         """Leave out the few pictures in which something else happened, if the others are fine."""
-        whole = (*best.images, *held_out)
-        # a single picture with a smaller p-value, where most are fine, shows more than one particle
-        fine = judge(whole, self.build, best.values, self.mapper).p_values > 1e-4
-        good = fine[: len(best.images)], fine[len(best.images) :]
-        bad = int(np.sum(~fine))
-        if not bad or bad > _CONTAMINATED_SHARE * len(whole):
-            return best, tuple(held_out)
-        kept = [s for s, ok in zip(best.images, good[0], strict=True) if ok]
-        rest = tuple(s for s, ok in zip(held_out, good[1], strict=True) if ok)
-        return self._fit(kept, best.values, best.names), rest
+        judged = judge((*best.images, *held_out), self.build, best.values, self.mapper)
+        kept, rest = without_contaminated(best.images, held_out, judged.p_values)
+        if len(kept) + len(rest) == judged.p_values.size:
+            return best, held_out
+        return self.fit(kept, best.values, best.names), rest
 
-    def _worthwhile(
-        self, best: Estimate, held_out: Sequence[ParticleImage]
-    ) -> tuple[Estimate, tuple[str, ...]]:
+    def _worthwhile(self, best: Estimate, held_out: Images) -> tuple[Estimate, tuple[str, ...]]:
         """Keep as many aberrations as improve the pictures that were not fitted."""
         terms = tuple(n for n in best.names if is_term(n))
         ladder = [
@@ -671,7 +590,7 @@ class OpticsSearch:
         for rung in reversed(rungs):  # the most first; fewer than too few are not tried
             names = tuple(n for n in best.names if not is_term(n) or n in rung)
             start = {**best.values, **{n: 0.0 for n in terms if n not in rung}}
-            fit = best if rung == terms else self._fit(best.images, start, names, _RUNG_PASSES)
+            fit = best if rung == terms else self.fit(best.images, start, names, _TRIAL_PASSES)
             tried.append((self._worth(fit, held_out), fit))
             # log-likelihood that fewer aberrations lose where still fewer cannot be better
             if tried[-1][0] < tried[0][0] - 20.0:
@@ -684,7 +603,7 @@ class OpticsSearch:
         if "polarization" not in self.free:
             return best, ()
         was = bool(best.values["analyzer"])
-        other = self._fit(best.images, {**best.values, "analyzer": not was}, best.names, passes=8)
+        other = self.fit(best.images, {**best.values, "analyzer": not was}, best.names, passes=8)
         gap = best.log_posterior - other.log_posterior
         if abs(gap) < TWIN_GAP:
             return best, ("analyzer",)
@@ -702,10 +621,10 @@ class OpticsSearch:
         mirrored["focus_nm"] = 2 * z - best.values["focus_nm"]
         turned = [replace(s, mass_kda=-s.mass_kda) for s in best.images]
         # after which a twin is far nearer than _CLOSE
-        other = self._fit(turned, mirrored, best.names, 4)
+        other = self.fit(turned, mirrored, best.names, 4)
         if best.log_likelihood - other.log_likelihood > _CLOSE * best.log_likelihood:
             return best, None
-        other = self._fit(other.images, other.values, best.names, _TRIAL_PASSES)
+        other = self.fit(other.images, other.values, best.names, _TRIAL_PASSES)
         other, _ = self._cleared(other, ())  # each among the rings that it makes itself
         gap = best.log_likelihood - other.log_likelihood
         apart = abs(other.values["focus_nm"] - best.values["focus_nm"])
@@ -716,9 +635,7 @@ class OpticsSearch:
             best, other, gap = other, best, -gap
         return best, Twin(other.values, gap)
 
-    def _signed(
-        self, best: Estimate, held_out: Sequence[ParticleImage]
-    ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
+    def _signed(self, best: Estimate, held_out: Images) -> tuple[Estimate, Images]:
         """Choose between a phase and its opposite, which a particle that leaves has."""
         if "reference_phase_deg" not in best.names:
             return best, tuple(held_out)
@@ -741,26 +658,22 @@ class OpticsSearch:
         self, final: Estimate, judgement: Judgement, twin: Twin | None, *, worse: bool
     ) -> tuple[str, ...]:
         """Say why the microscope may not be used."""
-        reasons = []
-        if not final.names:
-            reasons.append("the pictures determine none of the parameters")
-        if not final.converged:
-            reasons.append("the search did not converge")
-        for name in final.names:
-            low, high = self.limits.get(name, (-math.inf, math.inf))
-            if final.values[name] in (low, high):
-                reasons.append(f"{name} = {final.values[name]:g} lies at its limit")
-        if not judgement.good:
-            reasons.append(
-                f"the p-values of {judgement.p_values.size} of {judgement.pictures} are not "
-                f"uniform (p = {judgement.uniform_p:.1g}, mean reduced chi2 = "
-                f"{float(np.mean(judgement.chi2_reduced)):.3f})"
-            )
-        if worse:
-            reasons.append("the configured optics describe pictures that were not fitted better")
-        if twin is not None and not self.side:
-            reasons.append(
+        checks = (
+            (not final.names, "the pictures determine none of the parameters"),
+            (not final.converged, "the search did not converge"),
+            *(
+                (
+                    final.values[n] in self.limits.get(n, ()),
+                    f"{n} = {final.values[n]:g} lies at its limit",
+                )
+                for n in final.names
+            ),
+            (not judgement.good, judgement.complaint),
+            (worse, "the configured optics describe pictures that were not fitted better"),
+            (
+                twin is not None and not self.side,
                 "a focus on the other side explains the pictures as well, and optics.focus_nm does "
-                "not say which side it is"
-            )
-        return tuple(reasons)
+                "not say which side it is",
+            ),
+        )
+        return tuple(reason for applies, reason in checks if applies)

@@ -111,6 +111,13 @@ class ParticleImage:
         grid = PixelGrid(factor * was.x_nm, factor * was.y_nm, factor * was.pixel_nm)
         return replace(self, grid=grid, x_nm=factor * self.x_nm, y_nm=factor * self.y_nm)
 
+    @property
+    def offset_nm(self) -> tuple[float, float]:
+        """Place y, x of its particle from the centre of the picture."""
+        return self.y_nm - float(np.mean(self.grid.y_nm)), self.x_nm - float(
+            np.mean(self.grid.x_nm)
+        )
+
     def moved(self, private: FloatArray) -> ParticleImage:
         """Return the same pictures with another start."""
         x, y, z, mass, level = (float(v) for v in private)
@@ -118,12 +125,9 @@ class ParticleImage:
 
     def placed(self, x_nm: float, y_nm: float) -> ParticleImage:
         """Return the same picture with another place, or the nearest where it may be."""
-        (low, high), (left, right) = (
-            (float(np.mean(axis)) - ROAM_NM, float(np.mean(axis)) + ROAM_NM)
-            for axis in (self.grid.y_nm, self.grid.x_nm)
-        )
-        x, y = min(max(x_nm, left), right), min(max(y_nm, low), high)
-        return replace(self, x_nm=x, y_nm=y)
+        there = replace(self, x_nm=x_nm, y_nm=y_nm)
+        y, x = (float(np.clip(away, -ROAM_NM, ROAM_NM)) - away for away in there.offset_nm)
+        return replace(there, x_nm=x_nm + x, y_nm=y_nm + y)
 
     def raised(self, shift_nm: float) -> ParticleImage:
         """Return the same picture with another height, or the nearest that is possible."""
@@ -131,19 +135,14 @@ class ParticleImage:
         return replace(self, z_nm=min(max(self.z_nm + shift_nm, low), high))
 
 
-def models_of(
-    images: Sequence[ParticleImage], build: Build, settings: Settings
-) -> list[ForwardModel]:
+Images = Sequence[ParticleImage]
+
+
+def models_of(images: Images, build: Build, settings: Settings) -> list[ForwardModel]:
     """Give the microscope of every picture; those alike share one."""
-    models: dict[tuple[Any, ...], ForwardModel] = {}
-    out = []
-    for image in images:
-        own = image.seen_with(settings)
-        key = tuple(own.items())
-        if key not in models:
-            models[key] = build(own)
-        out.append(models[key])
-    return out
+    own = [tuple(image.seen_with(settings).items()) for image in images]
+    models = {each: build(dict(each)) for each in dict.fromkeys(own)}
+    return [models[each] for each in own]
 
 
 UNIT_KDA = 1e3  # at which interference and scattered light are told apart, by their powers
@@ -172,13 +171,15 @@ def contrast_of(image: ParticleImage) -> tuple[FloatArray, FloatArray]:
     return np.where(used, contrast - level, 0.0), variance
 
 
-def with_masses(
-    images: Sequence[ParticleImage], build: Build, settings: Mapping[str, Any]
-) -> tuple[ParticleImage, ...]:
+def with_masses(images: Images, build: Build, settings: Mapping[str, Any]) -> Images:
     """Give every image the mass that fits it best where it stands."""
     out = []
     for image, model in zip(images, models_of(images, build, settings), strict=True):
-        parts = _parts(model, image, (image.x_nm, image.y_nm))
+        place = image.grid, image.x_nm, image.y_nm, image.z_nm
+        signal, slopes = model.gradient(*place, UNIT_KDA)
+        # contrast per mass, and per square of the mass: interference, and the scattered light
+        square = (UNIT_KDA * slopes[3] - signal) / UNIT_KDA**2
+        parts = signal / UNIT_KDA - UNIT_KDA * square, square
         contrast, variance = contrast_of(image)
         weight = 1 / variance
         pictures = np.array([part - np.average(part, weights=weight) for part in parts])
@@ -187,15 +188,6 @@ def with_masses(
         mass, _ = best_amplitudes(overlaps[0], overlaps[1], gram[0, 0], gram[0, 1], gram[1, 1])
         out.append(replace(image, mass_kda=float(mass)))
     return tuple(out)
-
-
-def _parts(
-    model: Any, image: ParticleImage, place: tuple[float, float]
-) -> tuple[FloatArray, FloatArray]:
-    """Contrast per mass, and per square of the mass: interference, and the scattered light."""
-    signal, slopes = model.gradient(image.grid, *place, image.z_nm, UNIT_KDA)
-    slope = slopes[3]
-    return (2 * signal - UNIT_KDA * slope) / UNIT_KDA, (UNIT_KDA * slope - signal) / UNIT_KDA**2
 
 
 def best_amplitudes(
@@ -227,36 +219,25 @@ def best_amplitudes(
     )
 
 
-def average_particle_images(
-    images: Sequence[ParticleImage],
-) -> tuple[tuple[ParticleImage, ...], tuple[ParticleImage, ...]]:
+def average_particle_images(images: Images) -> tuple[Images, Images]:
     """Average the pictures of each focus, registered on each other, with the sign of each."""
-    placed = list(images)
-    averages = {}
+    placed, averages = list(images), []
     for offset in sorted({image.focus_steps for image in images}):
         members = [i for i, image in enumerate(images) if image.focus_steps == offset]
-        averages[offset], group = _average([images[i] for i in members])
+        average, group = _average([images[i] for i in members])
+        averages.append(average)
         for i, image in zip(members, group, strict=True):
             placed[i] = image
-    offsets = list(averages)
     # of a scan, whose averages are searched
-    chosen = np.unique(np.linspace(0, len(offsets) - 1, min(7, len(offsets))).round())
-    return tuple(averages[offsets[int(i)]] for i in chosen), tuple(placed)
+    chosen = np.unique(np.linspace(0, len(averages) - 1, min(7, len(averages))).round())
+    return tuple(averages[int(i)] for i in chosen), tuple(placed)
 
 
-def _average(images: Sequence[ParticleImage]) -> tuple[ParticleImage, list[ParticleImage]]:
+def _average(images: Images) -> tuple[ParticleImage, Images]:
     """Average pictures of one focus; their places are those of the average's centre."""
     contrasts, variances = zip(*(contrast_of(image) for image in images), strict=True)
     pixel = images[0].grid.pixel_nm
-    shifts = np.array(
-        [
-            (
-                (image.y_nm - float(np.mean(image.grid.y_nm))) / pixel,
-                (image.x_nm - float(np.mean(image.grid.x_nm))) / pixel,
-            )
-            for image in images
-        ]
-    )
+    shifts = np.array([image.offset_nm for image in images]) / pixel
     template = ndimage.shift(contrasts[0], -shifts[0], order=3, mode="nearest")
     variance = np.full(template.shape, float(np.median(variances[0])))
     for _ in range(_ROUNDS if len(images) > 1 else 0):
@@ -277,14 +258,10 @@ def _average(images: Sequence[ParticleImage]) -> tuple[ParticleImage, list[Parti
     average = ParticleImage(
         grid, CONDITIONAL, data, 0.0, 0.0, images[0].z_nm, focus_steps=images[0].focus_steps
     )
-    placed = [
-        replace(
-            image,
-            x_nm=float(np.mean(image.grid.x_nm) + dx * pixel),
-            y_nm=float(np.mean(image.grid.y_nm) + dy * pixel),
-        )
-        for image, (dy, dx) in zip(images, shifts, strict=True)
-    ]
+    placed = []
+    for image, shift in zip(images, (shifts * pixel).tolist(), strict=True):
+        y, x = (moved - was for moved, was in zip(shift, image.offset_nm, strict=True))
+        placed.append(replace(image, x_nm=image.x_nm + x, y_nm=image.y_nm + y))
     return average, placed
 
 
@@ -302,9 +279,7 @@ def _register(contrast: FloatArray, template: FloatArray, shift: FloatArray) -> 
     return np.asarray(-found if near else shift)
 
 
-def place_particle_images(
-    images: Sequence[ParticleImage], nominal: ForwardModel
-) -> list[ParticleImage]:
+def place_particle_images(images: Images, nominal: ForwardModel) -> Images:
     """Register pictures on their average, and say how much of it each shows."""
     (average,), placed = average_particle_images(images)
     scale = peak_per_amplitude(nominal)
@@ -405,21 +380,19 @@ def with_sign(config: Config) -> tuple[Config | None, str]:
     A line between contrast and mass fixes that sign, and with it the reference phase of two that
     differ by half a turn.
     """
-    phase = config.optics.reference_phase_deg
-    reason = ""
+    phase, reason = config.optics.reference_phase_deg, ""
     for turned in (phase, (phase + 360) % 360 - 180):
         update = {"reference_phase_deg": turned, "calibrate": "never", "file": None}
         learned = config.model_copy(update={"optics": config.optics.model_copy(update=update)})
         try:
             forward_model(learned, 1000.0)
+            return learned, ""
         except ConfigError as error:
             reason = str(error)
-        else:
-            return learned, ""
     return None, reason
 
 
-def with_heights(images: Sequence[ParticleImage], config: Config) -> Sequence[ParticleImage]:
+def with_heights(images: Images, config: Config) -> Images:
     """Let each particle have its own height, if heights are to be learned from the movie."""
     prior = height_prior(config, 0.0) if config.particle.height_is_open else None
     heights = None if prior is None else prior.range_nm
@@ -433,8 +406,8 @@ class Collected:
     config: Config
     """As configured: where the search begins, and what stays where pictures do not tell it."""
 
-    images: Sequence[ParticleImage]
-    others: Sequence[ParticleImage] = ()
+    images: Images
+    others: Images = ()
     """Particles whose rings are in the pictures."""
 
     near: Settings | None = None

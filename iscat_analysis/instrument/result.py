@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,15 +21,9 @@ from iscat_analysis.config import (
     toml_value,
 )
 from iscat_analysis.findings import Finding
-from iscat_analysis.findings.optics import (
-    DROPPED_TERMS,
-    PICTURES_LEFT_OUT,
-    TWIN_OPTICS,
-    UNDECIDED_OPTICS,
-    UNTOLD_OPTICS,
-)
-from iscat_analysis.instrument.measure import Judgement, Measured
-from iscat_analysis.instrument.particle_image import Build, ParticleImage, contrast_of
+from iscat_analysis.findings import optics as of
+from iscat_analysis.instrument.measure import Measured
+from iscat_analysis.instrument.particle_image import Build, Images, contrast_of
 from iscat_analysis.optics.local import BEND, DRIFT
 from iscat_analysis.optics.parameters import (
     FIELD,
@@ -62,13 +57,13 @@ class Pictures:
     na: float
 
 
-def make_pictures(images: Sequence[ParticleImage], build: Build, settings: Settings) -> Pictures:
+def make_pictures(images: Images, build: Build, settings: Settings) -> Pictures:
     """Average the pictures and what the microscope makes of them.
 
     Data and model are moved by the same interpolation, so that it shows in neither residual.
     """
     shape, pixel = images[0].grid.shape, images[0].grid.pixel_nm
-    sums, weight, noise = np.zeros((2, *shape)), 0.0, np.zeros(shape)
+    sums, weight = np.zeros((2, *shape)), 0.0
     typical = float(np.median([abs(image.mass_kda) for image in images]))
     for image in images:
         place = (image.grid, image.x_nm, image.y_nm, image.z_nm, image.mass_kda)
@@ -77,18 +72,12 @@ def make_pictures(images: Sequence[ParticleImage], build: Build, settings: Setti
         used = variance < 1e5
         contrast = np.where(used, contrast, model)
         model = model - float(np.average(model[used], weights=1 / variance[used]))
-        offset = (
-            (image.y_nm - float(np.mean(image.grid.y_nm))) / pixel,
-            (image.x_nm - float(np.mean(image.grid.x_nm))) / pixel,
-        )
+        back = -np.array(image.offset_nm) / pixel
         scale, level = image.mass_kda / typical, float(np.median(variance))
         for total, shown in zip(sums, (contrast, model), strict=True):
-            moved = ndimage.shift(shown, [-o for o in offset], order=3, mode="nearest")
-            total += scale * moved / level
+            total += scale * ndimage.shift(shown, back, order=3, mode="nearest") / level
         weight += scale**2 / level
-        noise += scale**2 / level
     measured, fitted = sums / weight
-    sigma = 1 / np.sqrt(noise)
     y, x = (np.arange(n) - (n - 1) / 2 for n in shape)
     rings = np.rint(np.hypot(y[:, None], x)).astype(int)
     inside = rings <= min(shape) // 2
@@ -109,11 +98,11 @@ def make_pictures(images: Sequence[ParticleImage], build: Build, settings: Setti
     return Pictures(
         measured=measured,
         model=fitted,
-        residual=(measured - fitted) / sigma,
+        residual=(measured - fitted) * math.sqrt(weight),
         pixel_nm=pixel,
         radius_nm=pixel * np.arange(first, count.size, dtype=np.float64),
         radial=ring_mean(measured),
-        radial_se=np.sqrt(ring_mean(sigma**2) / count[first:]),
+        radial_se=1 / np.sqrt(weight * count[first:]),
         radial_model=ring_mean(fitted),
         wavefront_nm=np.where(disc, wavefront, np.nan),
         transmission=np.where(disc, np.where(masked, settings["attenuation"], 1.0), np.nan),
@@ -175,29 +164,21 @@ class OpticsCalibration:
     def headline(self, picture_of: str = "particle") -> str:
         """Say in one line what was found."""
         judged, before = self.measured.judgement, self.measured.configured
-        parts = []
-        for name, unit in (("focus_nm", "nm"), ("na", ""), ("reference_phase_deg", "deg")):
-            if name in self.names:
-                label = {"focus_nm": "focus", "na": "NA", "reference_phase_deg": "phase"}[name]
-                parts.append(with_error(label, self.value(name), self.sigma(name), unit))
-        if FOCUS_STEP in self.names:
-            parts.append(
-                with_error("steps of", self.value(FOCUS_STEP), self.sigma(FOCUS_STEP), "nm")
-            )
-        for name, label, over in (
-            (DRIFT, "focus rising by", " in 1000 frames"),
-            (BEND, "focus bent by", " 1000 frames from the middle"),
-            *(
-                (name, "focus jumping by", f" at frame {frame}")
-                for name, (frame, _) in zip(JUMPS, self.config.optics.focus_jumps, strict=False)
-            ),
-        ):
-            if name in self.names:
-                parts.append(with_error(label, self.value(name), self.sigma(name), "nm") + over)
-        parts += [
-            with_error(name_in_words(n), self.value(n), self.sigma(n), n.rsplit("_", 1)[1])
-            for n in self.names
-            if n in FIELD
+        jumps = zip(JUMPS, self.config.optics.focus_jumps, strict=False)
+        labels = {
+            "focus_nm": ("focus", "nm"),
+            "na": ("NA", ""),
+            "reference_phase_deg": ("phase", "deg"),
+            FOCUS_STEP: ("steps of", "nm"),
+            DRIFT: ("focus rising by", "nm in 1000 frames"),
+            BEND: ("focus bent by", "nm 1000 frames from the middle"),
+            **{name: ("focus jumping by", f"nm at frame {frame}") for name, (frame, _) in jumps},
+            **{name: (name_in_words(name), name.rsplit("_", 1)[1]) for name in FIELD},
+        }
+        parts = [
+            with_error(label, self.value(name), self.sigma(name), unit)
+            for name, (label, unit) in labels.items()
+            if name in self.names
         ]
         terms = [n for n in self.names if is_term(n)]
         if terms:
@@ -233,18 +214,18 @@ class OpticsCalibration:
         lines = ["# Optics measured by `iscat calibrate optics`", "", "[optics]"]
         keys = ("polarization", "polarization_deg", "analyzer", "na", "attenuation", "mask_na",
                 "focus_nm", "reference_phase_deg")  # fmt: skip
-        for key in keys:
-            value = getattr(optics, key)
-            said = {True: "true", False: "false"}.get(value) if isinstance(value, bool) else None
-            text = said or (f'"{value}"' if isinstance(value, str) else f"{value:.9g}")
-            lines.append(f"{key} = {text}")
+        values = {key: getattr(optics, key) for key in keys}
+        lines += [
+            f"{key} = {v:.9g}" if type(v) is float else f"{key} = {toml_value(v)}"
+            for key, v in values.items()
+        ]
         terms = ", ".join(f"{n} = {v:.9g}" for n, v in optics.aberrations_nm.items())
         lines += [f"aberrations_nm = {{ {terms} }}"]
         uneven = {name: optics.field_term(name) for name in FIELD_TERMS if optics.field_term(name)}
         field = [*field_keys(uneven), *(["field_px"] if uneven else [])]
         lines += [f"{key} = {toml_value(getattr(optics, key))}" for key in field]
         lines += ["", "[uncertainty]"]
-        names, covariance = _of_optics(self.names, self.covariance)
+        names, covariance = _without(RISES, self.names, self.covariance)
         lines += [f"{name} = {self.sigma(name):.6g}" for name in names]
         quoted = ", ".join(f'"{name}"' for name in names)
         lines += ["", "[covariance]", f"names = [{quoted}]", "matrix = ["]
@@ -271,8 +252,8 @@ class OpticsCalibration:
             "dropped": self.names_of("dropped"),
             "undecided": list(found.undecided),
             "twin": None if twin is None else {"settings": dict(twin.settings), "gap": twin.gap},
-            "held_out": _judged(found.judgement),
-            "held_out_as_configured": _judged(found.configured),
+            "held_out": found.judgement.told,
+            "held_out_as_configured": found.configured.told,
             "particles": self.images,
             "contaminated": found.contaminated,
             "source": dict(self.source),
@@ -309,9 +290,8 @@ def make_result(
         rows.append((name, float(value), sigma, crb, float(configured[name]), state))
     untold, dropped = ([row[0] for row in rows if row[-1] == s] for s in ("prior", "dropped"))
     if not measured.refusals:
-        config = _with_covariance(
-            with_settings(config, measured.settings), estimate.names, covariance
-        )
+        there = with_settings(config, measured.settings)
+        config = _with_covariance(there, estimate.names, covariance)
     return OpticsCalibration(
         config=config,
         parameters=pd.DataFrame(rows, columns=list(COLUMNS)),
@@ -323,13 +303,6 @@ def make_result(
         source=source,
         notes=(*_notes(measured, untold, dropped), *notes),
     )
-
-
-def _of_optics(
-    names: tuple[str, ...], covariance: FloatArray
-) -> tuple[tuple[str, ...], FloatArray]:
-    """Leave out what is no property of the microscope."""
-    return _without(RISES, names, covariance)
 
 
 def _without(
@@ -351,31 +324,19 @@ def _notes(
     measured: Measured, untold: Sequence[str], dropped: Sequence[str]
 ) -> tuple[Finding, ...]:
     """Say in words what could not be known."""
-    notes = [UNTOLD_OPTICS({"names": ", ".join(untold)})] if untold else []
-    notes += [UNDECIDED_OPTICS({"name": name}) for name in measured.undecided]
+    notes = [of.UNTOLD_OPTICS({"names": ", ".join(untold)})] if untold else []
+    notes += [of.UNDECIDED_OPTICS({"name": name}) for name in measured.undecided]
     if dropped:
         pictures = measured.judgement.pictures
-        notes.append(DROPPED_TERMS({"names": ", ".join(dropped), "pictures": pictures}))
+        notes.append(of.DROPPED_TERMS({"names": ", ".join(dropped), "pictures": pictures}))
     if measured.contaminated:
-        notes.append(PICTURES_LEFT_OUT({"pictures": count(measured.contaminated, "picture")}))
+        notes.append(of.PICTURES_LEFT_OUT({"pictures": count(measured.contaminated, "picture")}))
     twin = measured.twin
     if twin is not None:
         focus, phase = (twin.settings[key] for key in ("focus_nm", "reference_phase_deg"))
-        lower = "lower" if twin.gap >= 0 else "higher"
-        notes.append(
-            TWIN_OPTICS(
-                {"focus_nm": focus, "phase_deg": phase, "gap": abs(twin.gap), "lower": lower}
-            )
-        )
+        said = {"gap": abs(twin.gap), "lower": "lower" if twin.gap >= 0 else "higher"}
+        notes.append(of.TWIN_OPTICS({"focus_nm": focus, "phase_deg": phase, **said}))
     return tuple(notes)
-
-
-def _judged(judgement: Judgement) -> dict[str, Any]:
-    return {
-        "p_values": judgement.p_values.tolist(),
-        "chi2_reduced": judgement.chi2_reduced.tolist(),
-        "uniform_p": judgement.uniform_p,
-    }
 
 
 def correlation(covariance: FloatArray) -> FloatArray:

@@ -15,9 +15,8 @@ the pictures most probable (D. J. C. MacKay, Neural Comput. 4, 415, 1992).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -28,9 +27,16 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.findings import printing
 from iscat_analysis.fitting.ranges import background_mode
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.instrument.collect import bright_particle_images, kind_of
-from iscat_analysis.instrument.measure import HELD_OUT_P, Judgement, judge
+from iscat_analysis.instrument.collect import Recording, bright_particle_images
+from iscat_analysis.instrument.measure import (
+    HELD_OUT_P,
+    Judgement,
+    judge,
+    parted,
+    without_contaminated,
+)
 from iscat_analysis.instrument.particle_image import (
+    Images,
     ParticleImage,
     place_particle_images,
     reach_nm,
@@ -46,7 +52,7 @@ from iscat_analysis.optics.forward import (
 )
 from iscat_analysis.optics.measured import Template, lattice_step_nm
 from iscat_analysis.optics.parameters import LEAST_IMAGES, settings_of
-from iscat_analysis.records import FloatArray, Mapper, Progress, silent
+from iscat_analysis.records import Box, FloatArray, Mapper, Progress, silent
 from iscat_analysis.text import in_toml
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
@@ -57,9 +63,6 @@ MARGINS_PX = (10, 6, 2)
 The farther the template reaches, the more is known of the rings of a particle's neighbours; but
 the larger a picture, the fewer hold one particle alone.
 """
-
-_HELD_OUT = 3  # every third picture is held out
-_CONTAMINATED_SHARE = 0.25  # more than this is the template's fault
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +98,7 @@ class MeasuredPicture:
 
     def to_dict(self) -> dict[str, Any]:
         """Give what ``template.json`` holds."""
-        found, judged = self.template, self.judgement
+        found = self.template
         return {
             "accepted": self.accepted,
             "refusals": list(self.refusals),
@@ -105,11 +108,7 @@ class MeasuredPicture:
             "peak_se": found.peak_se,
             "pixel_nm": found.pixel_nm,
             "roi_nm": found.roi_nm,
-            "held_out": {
-                "p_values": judged.p_values.tolist(),
-                "chi2_reduced": judged.chi2_reduced.tolist(),
-                "uniform_p": judged.uniform_p,
-            },
+            "held_out": self.judgement.told,
             "source": dict(self.source),
         }
 
@@ -142,7 +141,7 @@ def measure_template(
             'does not give: use fit.mode = "mass"'
         )
     ready = calibrated(movie, config, report=printing(notify))
-    movie, config, camera = ready.steady, ready.config, ready.camera
+    movie, config = ready.steady, ready.config
     pixel = float(config.camera.pixel_size_nm or np.nan)
     roi_nm = config.fit.roi_px(pixel) * pixel
     physics = config.optics.model_copy(update={"psf": "model", "template": None})
@@ -151,7 +150,8 @@ def measure_template(
             progress("particles", number, len(MARGINS_PX))
             larger = config.fit.model_copy(update={"roi_nm": roi_nm + 2 * margin * pixel})
             cut = config.model_copy(update={"fit": larger, "optics": physics, "calibration": None})
-            alone = _alone(*bright_particle_images(movie, cut, camera, pool, ready.opening))
+            recording = Recording(movie, cut, ready.camera, pool, ready.opening)
+            alone = _alone(*bright_particle_images(recording))
             if len(alone) >= 18:  # pictures with which a margin is good enough
                 break
         progress("particles", len(MARGINS_PX), len(MARGINS_PX))
@@ -162,72 +162,42 @@ def measure_template(
                 "particles, fewer at a time, or brighter ones"
             )
         nominal = forward_model(cut, max(map(reach_nm, alone)) + roi_nm / 10)
-        source = {
-            "movie": movie.path.name,
-            "sha256": movie.sha256(),
-            "kind": kind_of(config),
-            "version": version("iscat-analysis"),
-        }
-        step = lattice_step_nm(config.optics.wavelength_nm, config.optics.n_glass)
-        settings = {
-            "roi_nm": max(roi_nm, config.fit.roi_nm),
-            "step_nm": step,
-            "level": background_mode(config) == "sliding",
-        }
-        return _judged(
-            place_particle_images(alone, nominal), nominal, ready.with_frames_asked(config),
-            settings, source, pool.map,
-        )  # fmt: skip
+        fitter = PictureFitter(
+            nominal,
+            roi_nm=max(roi_nm, config.fit.roi_nm),
+            step_nm=lattice_step_nm(config.optics.wavelength_nm, config.optics.n_glass),
+            level=background_mode(config) == "sliding",
+            mapper=pool.map,
+        )
+        images = place_particle_images(alone, nominal)
+        return _judged(images, fitter, ready.with_frames_asked(config), recording.origin())
 
 
 def _judged(
-    images: Sequence[ParticleImage],
-    nominal: ForwardModel,
-    config: Config,
-    settings: Mapping[str, float],
-    source: Mapping[str, str],
-    mapper: Mapper,
+    images: Images, fitter: PictureFitter, config: Config, source: Mapping[str, str]
 ) -> MeasuredPicture:
     """Fit with a third held out, leave out what is not a particle alone, then fit them all."""
-    level = bool(settings["level"])
-    options = {"roi_nm": settings["roi_nm"], "step_nm": settings["step_nm"]}
 
-    def fit(some: Sequence[ParticleImage]) -> PictureFit:
-        return fit_picture(some, nominal, level=level, mapper=mapper, **options)
+    def judged(some: Images, found: PictureFit) -> Judgement:
+        model = with_template(fitter.nominal, found.template)
+        return judge(some, lambda _: model, settings_of(config), fitter.mapper)
 
-    def fitted_with(some: Sequence[ParticleImage], found: PictureFit) -> list[ParticleImage]:
-        model = with_template(nominal, found.template)
-        return list(mapper(lambda s: fit_own(s, model, level=level), some))
-
-    def judged(some: Sequence[ParticleImage], found: PictureFit) -> Judgement:
-        model = with_template(nominal, found.template)
-        return judge(some, lambda _: model, settings_of(config), mapper)
-
-    first = fit([s for i, s in enumerate(images) if i % _HELD_OUT != 1])
-    held = fitted_with(images[1::_HELD_OUT], first)
-    # something else happened in a picture with a smaller p-value
-    kept = [(some, judged(some, first).p_values > 1e-4) for some in (first.images, held)]
-    bad = sum(int(np.sum(~good)) for _, good in kept)
-    contaminated = 0
-    if 0 < bad <= _CONTAMINATED_SHARE * len(images):
-        contaminated = bad
-        rest = [s for s, ok in zip(*kept[0], strict=True) if ok]
-        first = fit(rest)
-        held = fitted_with([s for s, ok in zip(*kept[1], strict=True) if ok], first)
+    some, others = parted(images)
+    first = fitter.fit(some)
+    held = fitter.own(others, first.template)
+    p_values = judged((*first.images, *held), first).p_values
+    kept, rest = without_contaminated(first.images, held, p_values)
+    contaminated = p_values.size - len(kept) - len(rest)
+    if contaminated:
+        first = fitter.fit(kept)
+        held = fitter.own(rest, first.template)
     judgement = judged(held, first)
-    refusals = []
-    if judgement.uniform_p < HELD_OUT_P:
-        refusals.append(
-            f"of {judgement.p_values.size} pictures that were held out the p-values are not "
-            f"uniform (p = {judgement.uniform_p:.1g}, mean reduced chi2 = "
-            f"{float(np.mean(judgement.chi2_reduced)):.3f})"
-        )
-    return MeasuredPicture(
-        config, fit([*first.images, *held]), judgement, contaminated, source, tuple(refusals)
-    )
+    refusals = (judgement.complaint,) if judgement.uniform_p < HELD_OUT_P else ()
+    whole = fitter.fit([*first.images, *held])
+    return MeasuredPicture(config, whole, judgement, contaminated, source, refusals)
 
 
-def _alone(images: Sequence[ParticleImage], others: Sequence[ParticleImage]) -> list[ParticleImage]:
+def _alone(images: Images, others: Images) -> Images:
     """Leave out pictures into which another particle reaches."""
 
     def is_alone(image: ParticleImage) -> bool:
@@ -300,49 +270,122 @@ class PictureFit:
     """A template and the pictures that made it."""
 
     template: Template
-    images: tuple[ParticleImage, ...]
+    images: Images
     effective: float
-    rounds: int
 
 
-def fit_picture(
-    images: Sequence[ParticleImage],
-    nominal: ForwardModel,
-    *,
-    roi_nm: float,
-    step_nm: float,
-    level: bool,
-    mapper: Mapper = map,
-) -> PictureFit:
-    """Fit the picture that all particles share."""
-    pixel = images[0].grid.pixel_nm
-    side = max(images[0].grid.shape) * pixel
-    # between periodic images, beside what fades
-    waves = _Waves.within(1.2 / step_nm, side + 2 * (_FADE_NM + 250.0))
-    own = list(images)
-    blur = nominal.area.points(pixel)
-    coefficients, scale = np.zeros(2 * waves.qx.size - 1), peak_per_amplitude(nominal)
-    prior = np.eye(coefficients.size)
-    used, moved = 0, math.inf
-    while used < _ROUNDS and moved > _SETTLED:
-        used += 1
-        found = _solve(own, nominal, waves, coefficients, prior, scale, blur, level, mapper)
-        before, (coefficients, covariance, effective) = coefficients, found
-        coefficients, shift, size = _gauge(waves, coefficients, side / 2, step_nm, own)
-        own = [
-            replace(s, x_nm=s.x_nm + shift[0], y_nm=s.y_nm + shift[1], mass_kda=s.mass_kda * size)
-            for s in own
-        ]
-        covariance = covariance / size**2
-        prior = _prior(waves, coefficients, covariance, step_nm)
-        template = _template(
-            waves, coefficients, covariance, own, roi_nm=roi_nm, side_nm=side, step_nm=step_nm
-        )
-        template = replace(template, side=nominal.area.side if blur[0].size > 1 else 0.0)
-        model = with_template(nominal, template)
-        own = list(mapper(lambda s, m=model: fit_own(s, m, level=level), own))
-        moved = float(np.linalg.norm(coefficients - before) / np.sqrt(np.trace(covariance)))
-    return PictureFit(template, tuple(own), effective, used)
+@dataclass(frozen=True)
+class PictureFitter:
+    """Fits the picture that particles share, on a lattice, for regions of a side."""
+
+    nominal: ForwardModel
+    roi_nm: float
+    step_nm: float
+    level: bool
+    """Whether the light of every picture has a level of its own."""
+
+    mapper: Mapper = map
+
+    def own(self, images: Images, template: Template) -> Images:
+        """Fit what is each picture's own."""
+        model = with_template(self.nominal, template)
+        return list(self.mapper(lambda s: fit_own(s, model, level=self.level), images))
+
+    def fit(self, images: Images) -> PictureFit:
+        """Fit the picture that all particles share."""
+        pixel, own = images[0].grid.pixel_nm, images
+        side = max(images[0].grid.shape) * pixel
+        # between periodic images, beside what fades
+        waves = _Waves.within(1.2 / self.step_nm, side + 2 * (_FADE_NM + 250.0))
+        several = self.nominal.area.points(pixel)[0].size > 1
+        coefficients = np.zeros(2 * waves.qx.size - 1)
+        prior = np.eye(coefficients.size)
+        used, moved = 0, math.inf
+        while used < _ROUNDS and moved > _SETTLED:
+            used, before = used + 1, coefficients
+            coefficients, covariance, effective = self._step(own, waves, coefficients, prior)
+            coefficients, shift, size = _gauge(waves, coefficients, side / 2, self.step_nm, own)
+            x, y = shift
+            own = [
+                replace(s, x_nm=s.x_nm + x, y_nm=s.y_nm + y, mass_kda=s.mass_kda * size)
+                for s in own
+            ]
+            covariance = covariance / size**2
+            prior = _prior(waves, coefficients, covariance, self.step_nm)
+            contrast, sigma, peak_se = self._sampled(waves, coefficients, covariance, side)
+            template = Template(
+                contrast=contrast, sigma=sigma, step_nm=self.step_nm, pixel_nm=pixel,
+                roi_nm=self.roi_nm, peak_se=peak_se, sights=len(own),
+                side=self.nominal.area.side if several else 0.0,
+            )  # fmt: skip
+            own = self.own(own, template)
+            moved = float(np.linalg.norm(coefficients - before) / np.sqrt(np.trace(covariance)))
+        return PictureFit(template, own, effective)
+
+    def _step(
+        self, images: Images, waves: _Waves, coefficients: FloatArray, prior: FloatArray
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """One Gauss–Newton step of the picture, places and levels eliminated picture by picture.
+
+        Returns the coefficients, their covariance with the strengths held, and how many of them the
+        data determine.
+        """
+        began, scale = bool(np.any(coefficients)), peak_per_amplitude(self.nominal)
+        slopes = waves.slopes(coefficients)
+
+        def one(image: ParticleImage) -> tuple[FloatArray, FloatArray]:
+            grid, strength, gain = image.grid, image.mass_kda * scale, math.exp(image.level)
+            blur = self.nominal.area.points(grid.pixel_nm)
+            basis = waves.on(grid.x_nm - image.x_nm, grid.y_nm - image.y_nm, blur)
+            shown = strength * (basis @ coefficients)
+            bright = (1 + shown / 2) ** 2
+            contrast, weight = signal_of(image, self.nominal, (bright - 1).reshape(grid.shape))
+            root = np.sqrt(weight.ravel())
+            rest = root * (contrast.ravel() - (gain * bright - 1))
+            rate = root * gain * (1 + shown / 2) * strength
+            rows = basis * rate[:, None]
+            nuisance = [root * bright] if self.level else []
+            if began:
+                nuisance += [rate * (basis @ slope) for slope in slopes]
+            if nuisance:
+                q, _ = np.linalg.qr(np.stack(nuisance, axis=1))
+                rows, rest = rows - q @ (q.T @ rows), rest - q @ (q.T @ rest)
+            return rows.T @ rows, rows.T @ rest
+
+        found = list(self.mapper(one, images))
+        information, pull = (np.sum(each, axis=0) for each in zip(*found, strict=True))
+        values, vectors = np.linalg.eigh(prior.T @ information @ prior)
+        values = np.maximum(values, 0.0)
+        vectors = prior @ vectors
+        pull = pull + information @ coefficients
+        turned = vectors.T @ pull
+        ridge, effective = 1e-3 * float(values[-1]), 0.0
+        for _ in range(30):  # steps of the variance of the prior
+            solved = turned / (values + ridge)
+            effective = float(np.sum(values / (values + ridge)))
+            ridge = effective / float(np.sum(solved**2))
+        covariance = (vectors / (values + ridge)) @ vectors.T
+        return covariance @ pull, covariance, effective
+
+    def _sampled(
+        self, waves: _Waves, coefficients: FloatArray, covariance: FloatArray, side_nm: float
+    ) -> tuple[FloatArray, FloatArray, float]:
+        """Sample the picture and its error on the lattice, and give the error of its peak.
+
+        Beyond what was seen it fades.
+        """
+        count = math.ceil((side_nm / 2 + _FADE_NM) / self.step_nm)
+        axis = np.asarray(self.step_nm * np.arange(-count, count + 1), dtype=np.float64)
+        beyond = np.clip((np.abs(axis) - side_nm / 2) / _FADE_NM, 0, 1)
+        fade = np.cos(math.pi / 2 * beyond) ** 2
+        basis, window = waves.on(axis, axis, None), np.outer(fade, fade)
+        image = (basis @ coefficients).reshape(window.shape) * window
+        variance = np.einsum("pi,pi->p", basis @ covariance, basis).reshape(window.shape)
+        # the strengths take what resembles the picture itself; the rest moves the peak
+        peak = basis[int(np.argmax(np.abs(image)))]
+        own = coefficients / np.sum(coefficients**2)
+        rest = peak - (peak @ coefficients) * own
+        return image, np.sqrt(variance) * window, float(np.sqrt(rest @ covariance @ rest))
 
 
 def fit_own(image: ParticleImage, model: ForwardModel, *, level: bool) -> ParticleImage:
@@ -356,64 +399,8 @@ def fit_own(image: ParticleImage, model: ForwardModel, *, level: bool) -> Partic
     low, high = start - room, start + room
     low[:2], high[:2] = centre - _ROAM_NM, centre + _ROAM_NM
     free = np.array([True, True, False, True, level])
-    found = likelihood.maximize(start, free, low, high).theta
+    found = likelihood.maximize(start, Box(free, low, high)).theta
     return image.moved(found)
-
-
-def _solve(
-    images: Sequence[ParticleImage],
-    nominal: ForwardModel,
-    waves: _Waves,
-    coefficients: FloatArray,
-    prior: FloatArray,
-    scale: float,
-    blur: tuple[FloatArray, FloatArray],
-    level: bool,
-    mapper: Mapper,
-) -> tuple[FloatArray, FloatArray, float]:
-    """One Gauss–Newton step of the picture, places and levels eliminated picture by picture.
-
-    Returns the coefficients, their covariance with the strengths held, and how many of them the
-    data determine.
-    """
-    began = bool(np.any(coefficients))
-    along, up = waves.slopes(coefficients)
-
-    def one(image: ParticleImage) -> tuple[FloatArray, FloatArray]:
-        grid, strength, gain = image.grid, image.mass_kda * scale, math.exp(image.level)
-        basis = waves.on(grid.x_nm - image.x_nm, grid.y_nm - image.y_nm, blur)
-        shown = strength * (basis @ coefficients)
-        bright = (1 + shown / 2) ** 2
-        contrast, weight = signal_of(image, nominal, (bright - 1).reshape(grid.shape))
-        root = np.sqrt(weight.ravel())
-        rest = root * (contrast.ravel() - (gain * bright - 1))
-        rate = root * gain * (1 + shown / 2) * strength
-        rows = basis * rate[:, None]
-        nuisance = [root * bright] if level else []
-        if began:
-            nuisance += [rate * (basis @ slope) for slope in (along, up)]
-        if nuisance:
-            q, _ = np.linalg.qr(np.stack(nuisance, axis=1))
-            rows = rows - q @ (q.T @ rows)
-            rest = rest - q @ (q.T @ rest)
-        return rows.T @ rows, rows.T @ rest
-
-    found = list(mapper(one, images))
-    information = np.sum([each[0] for each in found], axis=0)
-    pull = np.sum([each[1] for each in found], axis=0) + information @ coefficients
-    values, vectors = np.linalg.eigh(prior.T @ information @ prior)
-    values = np.maximum(values, 0.0)
-    vectors = prior @ vectors
-    turned = vectors.T @ pull
-    ridge = 1e-3 * float(values[-1])
-    effective = 0.0
-    for _ in range(30):  # steps of the variance of the prior
-        solved = turned / (values + ridge)
-        effective = float(np.sum(values / (values + ridge)))
-        ridge = effective / float(np.sum(solved**2))
-    solved = turned / (values + ridge)
-    covariance = (vectors / (values + ridge)) @ vectors.T
-    return vectors @ solved, covariance, effective
 
 
 def _prior(
@@ -436,11 +423,7 @@ def _prior(
 
 
 def _gauge(
-    waves: _Waves,
-    coefficients: FloatArray,
-    half_nm: float,
-    step_nm: float,
-    images: Sequence[ParticleImage],
+    waves: _Waves, coefficients: FloatArray, half_nm: float, step_nm: float, images: Images
 ) -> tuple[FloatArray, tuple[float, float], float]:
     """Centre the energy, make the peak 1 and landings positive; give the shift and the factor."""
     axis = np.arange(-half_nm, half_nm + step_nm / 2, step_nm)
@@ -456,37 +439,3 @@ def _gauge(
     if sum(math.copysign(1.0, image.mass_kda) for image in images) < 0:
         size = -size
     return centred / size, (x, y), size
-
-
-def _template(
-    waves: _Waves,
-    coefficients: FloatArray,
-    covariance: FloatArray,
-    images: Sequence[ParticleImage],
-    *,
-    roi_nm: float,
-    side_nm: float,
-    step_nm: float,
-) -> Template:
-    """Sample the picture on its lattice; beyond what was seen it fades."""
-    count = math.ceil((side_nm / 2 + _FADE_NM) / step_nm)
-    axis = np.asarray(step_nm * np.arange(-count, count + 1), dtype=np.float64)
-    beyond = np.clip((np.abs(axis) - side_nm / 2) / _FADE_NM, 0, 1)
-    fade = np.cos(math.pi / 2 * beyond) ** 2
-    basis = waves.on(axis, axis, None)
-    window = np.outer(fade, fade)
-    image = (basis @ coefficients).reshape(axis.size, axis.size) * window
-    variance = np.einsum("pi,pi->p", basis @ covariance, basis).reshape(image.shape)
-    # the strengths take what resembles the picture itself; the rest moves the peak
-    peak = basis[int(np.argmax(np.abs(image)))]
-    own = coefficients / np.sum(coefficients**2)
-    rest = peak - (peak @ coefficients) * own
-    return Template(
-        contrast=image,
-        sigma=np.sqrt(variance) * window,
-        step_nm=step_nm,
-        pixel_nm=images[0].grid.pixel_nm,
-        roi_nm=roi_nm,
-        peak_se=float(np.sqrt(rest @ covariance @ rest)),
-        sights=len(images),
-    )

@@ -13,35 +13,27 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from iscat_analysis.config import JUMPS, MOVES, Config
-from iscat_analysis.fitting.ranges import fitted_frames
-from iscat_analysis.instrument.joint_fit import Asked, Estimate, asked_changes, maximise
+from iscat_analysis.fitting.ranges import background_mode, fitted_frames
+from iscat_analysis.instrument.joint_fit import Estimate, PictureScores, maximise
 from iscat_analysis.instrument.measure import HELD_OUT
 from iscat_analysis.instrument.particle_image import (
     Build,
     Collected,
-    ParticleImage,
+    Images,
     microscopes,
     reach_nm,
     with_heights,
     with_masses,
 )
 from iscat_analysis.movie import Stack
-from iscat_analysis.optics.local import (
-    BASES,
-    BEND,
-    DRIFT,
-    DRIFT_FRAMES,
-    Spot,
-    centre_of,
-    changes_at,
-)
+from iscat_analysis.optics.local import BEND, DRIFT, DRIFT_FRAMES, Spot, centre_of, changes_at
 from iscat_analysis.optics.parameters import FREE, Settings, free_names, is_usual, prior_of
 from iscat_analysis.records import FloatArray, Mapper
 
@@ -83,7 +75,6 @@ _SHARED = ("focus_nm", "reference_phase_deg")  # free beside a change before opt
 _SIDE = 2  # pictures on either side of a jump
 _BLOCKS, _BLOCK = 6, 4  # parts of a movie with a focus of their own, and least pictures of one
 _PASSES = 10
-_NEVER: Mapping[str, float] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -99,8 +90,9 @@ class FieldOfView:
     """Frames from which on the focus is another one."""
 
     @classmethod
-    def of(cls, movie: Stack, config: Config, *, in_time: bool) -> FieldOfView:
-        """Describe that of a movie."""
+    def of(cls, movie: Stack, config: Config) -> FieldOfView:
+        """Describe that of a movie; time tells something of landings alone."""
+        in_time = background_mode(config) == "sliding"
         frames = fitted_frames(movie, config, config.background.recorded)
         shape = (movie.shape[1], movie.shape[2])
         pixel = config.camera.pixel_size_nm or math.nan
@@ -111,7 +103,7 @@ class FieldOfView:
         """Frame in the middle."""
         return sum(self.frames) // 2
 
-    def placed(self, images: Sequence[ParticleImage]) -> list[ParticleImage]:
+    def placed(self, images: Images) -> Images:
         """Give pictures their places, and the times of the frames that show their particle."""
         first, last = self.frames
         # parts of the movie with a time of their own, in which pictures are looked at
@@ -129,7 +121,7 @@ class FieldOfView:
             out.append(replace(image, place=place, focus_steps=time, after=after))
         return out
 
-    def undivided(self, images: Sequence[ParticleImage]) -> list[ParticleImage]:
+    def undivided(self, images: Images) -> Images:
         """Leave pictures out whose frames lie on both sides of a jump."""
         return [
             image
@@ -139,7 +131,7 @@ class FieldOfView:
             )
         ]
 
-    def jumping(self, images: Sequence[ParticleImage], between: tuple[int, int]) -> FieldOfView:
+    def jumping(self, images: Images, between: tuple[int, int]) -> FieldOfView:
         """Add a jump of the focus that lies between two pictures, in the order of time."""
         return replace(self, jumps=(*self.jumps, jump_frame(self, images, between)))
 
@@ -158,7 +150,7 @@ class Change:
     """A kind of change that pictures ask for, to first order."""
 
     kind: str = ""
-    terms: Mapping[str, float] = field(default_factory=lambda: _NEVER)
+    terms: Mapping[str, float] = field(default_factory=dict[str, float])
     significance: float = 0.0
     rise_nm: float = 0.0
     jump: int = 0
@@ -183,55 +175,53 @@ class Change:
         return f"{self.kind} by about {size:.0f} {unit} towards the edge of the field"
 
 
-EVEN = Change()
+NO_CHANGE = Change()
 """Where nothing is known of a change."""
 
 
 def asked_change(
-    images: Sequence[ParticleImage],
-    config: Config,
-    settings: Settings,
-    view: FieldOfView,
-    mapper: Mapper = map,
+    images: Images, config: Config, settings: Settings, view: FieldOfView, mapper: Mapper = map
 ) -> Change:
     """Find the kind of change that pictures ask for most, beside another focus and phase."""
     seen = view.placed(with_heights(images, config))
     if len({image.spot for image in seen}) < LEAST_PICTURES:
-        return EVEN
+        return NO_CHANGE
     build = microscopes(config, max(map(reach_nm, images)))
-    wishes = _Wishes.of(seen, build, settings, _SHARED, view, mapper)
-    return next(iter([*wishes.changes(), *wishes.rest()]), EVEN)
+    tests = _ScoreTests.of(seen, build, settings, _SHARED, view, mapper)
+    return next(iter([*tests.changes(), *tests.rest()]), NO_CHANGE)
 
 
 @dataclass(frozen=True)
-class _Wishes:
-    """What pictures ask for beside parameters that all of them share."""
+class _ScoreTests:
+    """Score tests of terms of field and time, beside parameters that all pictures share."""
 
-    images: Sequence[ParticleImage]
+    scores: PictureScores
     shared: Sequence[str]
-    asked: Asked
     view: FieldOfView
 
     @classmethod
     def of(
         cls,
-        images: Sequence[ParticleImage],
+        images: Images,
         build: Build,
         settings: Settings,
         shared: Sequence[str],
         view: FieldOfView,
         mapper: Mapper,
-    ) -> _Wishes:
-        """Ask pictures."""
-        terms = (term for names in KINDS.values() for term in names)
-        bases = dict.fromkeys(b for name in (*shared, *terms) for b in BASES.get(name, (name,)))
-        asked = asked_changes(images, build, settings, tuple(bases), mapper)
-        return cls(images, shared, asked, view)
+    ) -> _ScoreTests:
+        """Score pictures."""
+        names = [*shared, *chain.from_iterable(KINDS.values())]
+        return cls(PictureScores.of(images, build, settings, names, mapper), shared, view)
+
+    @property
+    def images(self) -> Images:
+        """The pictures."""
+        return self.scores.images
 
     def changes(self) -> list[Change]:
         """Give the kinds of change, the clearest first."""
         found = [
-            self._change(kind, names, self._slopes(names))
+            self._change(kind, names, self.scores.slopes(names))
             for kind, names in KINDS.items()
             if not set(names) <= set(self.shared)
             and (self.view.in_time or not set(names) & set(MOVES))
@@ -245,10 +235,10 @@ class _Wishes:
         if not self.view.in_time or number < 2:
             return []
         order = np.argsort([image.shown for image in self.images])
-        slopes = np.zeros((len(self.images), number - 1, len(self.asked.names)))
+        moved = np.zeros((len(self.images), number - 1))
         for block, pictures in enumerate(np.array_split(order, number)[1:]):
-            slopes[pictures, block, self.asked.names.index("focus_nm")] = 1.0
-        rises, significance = self._step(slopes)
+            moved[pictures, block] = 1.0
+        rises, significance = self._step(self._of_focus(moved))
         spread = float(np.ptp([0.0, *rises]))
         if not _by_no_chance(significance, number - 1) or spread < LEAST_CHANGE["focus_nm"]:
             return []
@@ -264,30 +254,25 @@ class _Wishes:
             return []
         order = np.argsort([image.shown for image in self.images])
         taken = {sum(not self.images[k].after[jump] for k in order) for jump in range(known)}
-        asked: dict[int, tuple[float, FloatArray]] = {}
-        for before in sorted({*range(1, number)} - taken):
-            slopes = np.zeros((number, 1, len(self.asked.names)))
-            slopes[order[before:], 0, self.asked.names.index("focus_nm")] = 1.0
-            asked[before] = self._step(slopes)[1], slopes
-        before = max(asked, key=lambda split: asked[split][0], default=0)
+        rank = np.argsort(order)  # of each picture in time
+        slopes = {
+            before: self._of_focus((rank >= before)[:, None].astype(float))
+            for before in sorted({*range(1, number)} - taken)
+        }
+        before = max(slopes, key=lambda split: self._step(slopes[split])[1], default=0)
         if not _SIDE <= before <= number - _SIDE:
             return []
-        found = self._change(JUMP, (JUMPS[known],), asked[before][1], trials=number)
+        found = self._change(JUMP, (JUMPS[known],), slopes[before], trials=number)
         return [found and replace(found, jump=before)]
 
-    def _slopes(self, names: Sequence[str]) -> FloatArray:
-        """Give what parameters change about the optics of every picture, (n, m, k)."""
-        out = np.zeros((len(self.images), len(names), len(self.asked.names)))
-        for number, image in enumerate(self.images):
-            for term, name in enumerate(names):
-                for base, weight in image.slopes(name).items():
-                    out[number, term, self.asked.names.index(base)] = weight
-        return out
+    def _of_focus(self, moved: FloatArray) -> FloatArray:
+        """Give the slopes of what moves the focus alone; shapes: `moved` (n, m), (n, m, k)."""
+        return np.asarray(moved[:, :, None] * (np.array(self.scores.names) == "focus_nm"))
 
     def _step(self, slopes: FloatArray) -> tuple[FloatArray, float]:
         """Give what is asked for beside what is shared, and how clearly in squared errors."""
-        both = np.concatenate([self._slopes(self.shared), slopes], axis=1)
-        step, covariance = self.asked.step(both)
+        both = np.concatenate([self.scores.slopes(self.shared), slopes], axis=1)
+        step, covariance = self.scores.step(both)
         size, errors = step[len(self.shared) :], covariance[len(self.shared) :, len(self.shared) :]
         if not np.all(np.diag(errors) > 0):
             return size, 0.0
@@ -308,7 +293,7 @@ class _Wishes:
         ):
             return None
         changes = np.abs(np.einsum("nmk,m->nk", slopes, size)).max(axis=0)
-        largest = zip(self.asked.names, changes.tolist(), strict=True)
+        largest = zip(self.scores.names, changes.tolist(), strict=True)
         # the same for an aberration
         if all(change < LEAST_CHANGE.get(base, 2.0) for base, change in largest):
             return None
@@ -347,7 +332,7 @@ _DARK = 0.5  # of the brightest frame, below which one shows no light
 _CORE_NM = 350.0  # from the middle of a picture: what lands beside it changes little of that
 
 
-def jump_frame(view: FieldOfView, images: Sequence[ParticleImage], between: tuple[int, int]) -> int:
+def jump_frame(view: FieldOfView, images: Images, between: tuple[int, int]) -> int:
     """Find the frame of a jump between two pictures: what has landed changes in it, all at once.
 
     Around each particle every frame is compared with the change from one end to the other, and the
@@ -359,44 +344,33 @@ def jump_frame(view: FieldOfView, images: Sequence[ParticleImage], between: tupl
     low = max(round(last.frames[0]) - _ENDS, view.frames[0])
     high = min(round(2 * first.frames[1] - first.step) + _ENDS, view.frames[1])
     reach = round(_CORE_NM / view.pixel_nm)
-    places = [
-        tuple(
-            slice(max(round(at / view.pixel_nm) - reach, 0), round(at / view.pixel_nm) + reach + 1)
-            for at in (image.y_nm, image.x_nm)
-        )
-        for image in order
-        if image.step < low
-    ]
+    places = []
+    for image in (image for image in order if image.step < low):
+        y, x = (round(at / view.pixel_nm) for at in (image.y_nm, image.x_nm))
+        rows, columns = (slice(max(at - reach, 0), at + reach + 1) for at in (y, x))
+        places.append((slice(None), rows, columns))
+    found = round((last.shown + first.shown) / 2)
     frames, light = _lit(view.movie, np.r_[low : low + _ENDS, high - _ENDS : high])
-    start, end = (
-        [one for frame, one in zip(frames, light, strict=True) if (frame < low + _ENDS) == early]
-        for early in (True, False)
-    )
-    if not start or not end:
-        return round((last.shown + first.shown) / 2)
-    changes = [
-        np.mean([one[place].ravel() for one in end], axis=0)
-        - np.mean([one[place].ravel() for one in start], axis=0)
-        for place in places
-    ]
-    # standard errors that each particle counts for at most
-    found, vote = round((last.shown + first.shown) / 2), 6.0
+    early = frames < low + _ENDS
+    if early.all() or not early.any():
+        return found
+    change = light[~early].mean(axis=0, keepdims=True) - light[early].mean(axis=0, keepdims=True)
+    vote = 6.0  # standard errors that each particle counts for at most
     while places:
-        frames, light = _lit(
-            view.movie, np.unique(np.linspace(low, high - 1, _LOOKED_AT, dtype=int))
-        )
-        number = np.arange(1, len(frames))
-        clear = np.zeros((len(places), len(number)))
-        for own, place, change in zip(clear, places, changes, strict=True):
-            seen = np.array([one[place].ravel() for one in light])
-            sums = np.cumsum(seen @ change)
-            steps = (sums[-1] - sums[:-1]) / number[::-1] - sums[:-1] / number
-            noise = np.std(np.diff(seen, axis=0)) / math.sqrt(2) * np.linalg.norm(change)
-            own[:] = np.sqrt(number * number[::-1] / len(frames)) * np.abs(steps) / noise
+        number = np.unique(np.linspace(low, high - 1, _LOOKED_AT, dtype=int))
+        frames, light = _lit(view.movie, number)
+        before = np.arange(1, len(frames))
+        after, clear = before[::-1], []
+        for place in places:
+            own, seen = change[place].ravel(), light[place].reshape(len(light), -1)
+            sums = np.cumsum(seen @ own)
+            steps = (sums[-1] - sums[:-1]) / after - sums[:-1] / before
+            noise = np.std(np.diff(seen, axis=0)) / math.sqrt(2) * np.linalg.norm(own)
+            clear.append(np.sqrt(before * after / len(frames)) * np.abs(steps) / noise)
         # where all have their vote, those whose steps are clearest
         votes = np.minimum(clear, vote).sum(axis=0)
         # of votes, which rounding makes
-        likely = np.where(votes >= votes.max() - 1e-9, clear.sum(axis=0), 0.0)
+        likely = np.where(votes >= votes.max() - 1e-9, np.sum(clear, axis=0), 0.0)
         found = int(frames[int(np.argmax(likely)) + 1])
         if high - low <= _LOOKED_AT:
             break
@@ -405,13 +379,12 @@ def jump_frame(view: FieldOfView, images: Sequence[ParticleImage], between: tupl
     return found
 
 
-def _lit(movie: Stack, frames: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[FloatArray]]:
-    """Read frames, and leave out those without light; each over its mean."""
-    light = [movie.read(frame, frame + 1)[0].astype(np.float64) for frame in frames.tolist()]
-    level = np.array([one.mean() for one in light])
+def _lit(movie: Stack, frames: NDArray[np.int64]) -> tuple[NDArray[np.int64], FloatArray]:
+    """Read frames, and leave out those without light; each over its mean; shape (t, y, x)."""
+    light = np.array([movie.read(frame, frame + 1)[0] for frame in frames.tolist()], dtype=float)
+    level = light.mean(axis=(1, 2))
     lit = level > _DARK * level.max()
-    shown = [one / mean for one, mean, kept in zip(light, level, lit, strict=True) if kept]
-    return frames[lit], shown
+    return frames[lit], light[lit] / level[lit, None, None]
 
 
 def in_uneven_field(
@@ -426,14 +399,12 @@ def in_uneven_field(
     build = microscopes(config, max(map(reach_nm, images)))
     prior = prior_of(config)
     signed = with_masses(images, build, settings)  # what leaves is seen before
-    pictures = sorted(view.placed(signed), key=lambda image: -image.snr)
+    pictures: Images = sorted(view.placed(signed), key=lambda image: -image.snr)
 
-    def fitted(some: Sequence[ParticleImage], start: Settings, names: Sequence[str]) -> Estimate:
+    def fitted(some: Images, start: Settings, names: Sequence[str]) -> Estimate:
         return maximise(some, build, start, names, prior=prior, passes=_PASSES, mapper=mapper)
 
-    def tried(
-        pictures: Sequence[ParticleImage], start: Settings, names: Sequence[str]
-    ) -> tuple[Settings, float]:
+    def tried(pictures: Images, start: Settings, names: Sequence[str]) -> tuple[Settings, float]:
         """Fit all parts of the pictures but one, which is judged, in turns."""
         values, total = start, 0.0
         for part in range(HELD_OUT):
@@ -447,8 +418,8 @@ def in_uneven_field(
     kept, refused = list[tuple[str, ...]](), set[str]()
     while True:
         best = fitted(pictures, values, names)
-        wishes = _Wishes.of(best.images, build, best.values, names, view, mapper)
-        change = next((each for each in wishes.changes() if each.kind not in refused), EVEN)
+        tests = _ScoreTests.of(best.images, build, best.values, names, view, mapper)
+        change = next((each for each in tests.changes() if each.kind not in refused), NO_CHANGE)
         if not change.matters:
             break
         refused.add(change.kind)
@@ -474,7 +445,7 @@ def in_uneven_field(
         while view.jumps and JUMPS[len(view.jumps) - 1] not in names:
             view = replace(view, jumps=view.jumps[:-1])
             pictures = view.placed(pictures)
-    refusal = "; ".join(change.said for change in wishes.rest())
+    refusal = "; ".join(change.said for change in tests.rest())
     if not kept and not refusal:
         return None
     return Collected(

@@ -112,7 +112,7 @@ def _likelihood_of(
     place = step.x_px * context.pixel_nm, step.y_px * context.pixel_nm
     return conditional(
         context.model_at(*place, step.frame), grid, before, after, ratio,
-        read_variance_before_e2=frames[0] * read, read_variance_after_e2=frames[1] * read,
+        read_variances_e2=(frames[0] * read, frames[1] * read),
         masked=~step.usable[inside],
     )  # fmt: skip
 

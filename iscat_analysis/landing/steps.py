@@ -233,12 +233,13 @@ class ChunkFitter:
                     step.sign, task.at, model_of(likelihood), fit, excess
                 )
             likelihood, start = task.likelihood, task.displaced(self._seated(step))
-            box = search_box(likelihood, start, self._quick_mode, z_range, level=True)
-            theta = start_theta(likelihood, start) if step.theta is None else step.theta.copy()
+            begin = start_theta(likelihood, start)
+            box = search_box(likelihood, begin, self._quick_mode, z_range, level=True)
+            theta = begin if step.theta is None else step.theta.copy()
             if not box.free[2]:
                 theta[2] = start.z_nm
             theta = np.where(box.free, np.clip(theta, box.lower, box.upper), theta)
-            best = likelihood.maximize(theta, box.free, box.lower, box.upper)
+            best = likelihood.maximize(theta, box)
             if likelihood.model.scale.mass(best.theta[3]) <= 0:
                 return replace(step, at=task.at, snr=0.0)
             return self._moved(step, task, best.theta, detection_snr(likelihood, best, box))

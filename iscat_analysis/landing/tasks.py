@@ -160,8 +160,7 @@ class TaskBuilder:
             context.model_at(*place, sum(ranges[1]) // 2),
             PixelGrid.region(region.rows, region.columns, context.pixel_nm),
             before, after, ratio if step.sign > 0 else 1 / ratio,
-            read_variance_before_e2=variances[0], read_variance_after_e2=variances[1],
-            masked=windows.masked,
+            read_variances_e2=(variances[0], variances[1]), masked=windows.masked,
         )  # fmt: skip
         likelihood = context.with_prior(likelihood, step.start.mass_kda)
         return Task(likelihood, region, patch, windows, at, n_before, n_after, crowded, offset)

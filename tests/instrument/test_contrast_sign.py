@@ -98,13 +98,7 @@ def test_what_the_movie_does_not_tell_is_not_said_to_go_on(
     assert 'by optics.calibrate = "never" the optics are not learned' in never
 
     def the_focus_alone(
-        seen: Collected,
-        _movie: Any,
-        _config: Any,
-        _camera: Any,
-        _free: Any,
-        origin: Any,
-        _pool: Any,
+        seen: Collected, _recording: Any, _free: Any, origin: Any
     ) -> OpticsCalibration:
         return fit_optics(seen, ("focus",), origin)
 

@@ -36,14 +36,13 @@ def _estimate(images: Sequence[ParticleImage], values: Settings) -> Estimate:
         log_likelihood=0.0,
         log_prior=0.0,
         converged=True,
-        passes=1,
     )
 
 
 class _Moving(OpticsSearch):
     """Every fit of optics moves all heights by a fringe."""
 
-    def _fit(
+    def fit(
         self,
         images: Sequence[ParticleImage],
         start: Settings,

@@ -17,7 +17,6 @@ from scipy.ndimage import gaussian_filter, shift
 import iscat_analysis as ia
 from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import Calibration, Config
-from iscat_analysis.findings.optics import OPTICS_LEARNED
 from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.laws import CONDITIONAL
 from iscat_analysis.instrument import learning
@@ -41,12 +40,23 @@ def _learn(
     """Whether the configuration stayed, the summary, and what the user was told."""
     config = _config(calibrate)
     images, _, _ = make_particle_images(changes, count, seed=3)
+    learned, summary, said = _learned(monkeypatch, config, images, noise_differs=noise_differs)
+    return learned == config, summary, said
+
+
+def _learned(
+    monkeypatch: pytest.MonkeyPatch,
+    config: Config,
+    images: list[ParticleImage],
+    *,
+    noise_differs: bool = False,
+) -> tuple[Config, dict[str, Any], list[str]]:
+    """Learn the optics of a movie with these bright particles."""
     monkeypatch.setattr(learning, "noise_differs", lambda *_: noise_differs)
     monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (images, []))
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     learned, summary, findings = learn_optics(MOVIE, config, camera)
-    said = [finding.text for finding in findings]
-    return learned == config, summary, said
+    return learned, summary, [finding.text for finding in findings]
 
 
 def _config(calibrate: str) -> Config:
@@ -121,11 +131,7 @@ def test_pairs_that_land_at_once_do_not_condemn_the_optics(
     config = _config("auto")
     singles, _, _ = make_particle_images(changes, 5, seed=3)
     images = [*_pairs(changes, 6, 4), *singles]
-    monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
-    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (images, []))
-    camera = camera_from_config(config.camera, (64, 64), "uint16")
-    learned, summary, findings = learn_optics(MOVIE, config, camera)
-    said = [finding.text for finding in findings]
+    learned, summary, said = _learned(monkeypatch, config, images)
     assert (learned == config) == fits
     assert abs(learned.optics.aberrations_nm.get("z11", 0.0) - changes.get("z11", 0.0)) < 3.0
     assert (summary["median_p"] > REJECTED_P) == fits
@@ -190,13 +196,9 @@ def test_few_particles_move_the_optics(
 
 def test_usual_errors_can_be_others(monkeypatch: pytest.MonkeyPatch) -> None:
     config = _config("auto")
-    images, _, _ = make_particle_images({}, 0, seed=3)
-    monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
-    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (images, []))
     known = config.uncertainty.model_copy(update={"optics": {"focus_nm": 2.0}})
-    camera = camera_from_config(config.camera, (64, 64), "uint16")
     sure = config.model_copy(update={"uncertainty": known})
-    summary = learn_optics(MOVIE, sure, camera).summary
+    _, summary, _ = _learned(monkeypatch, sure, [])
     assert _sigma(summary, "focus_nm") == pytest.approx(2.0)
     assert _sigma(summary, "na") == pytest.approx(0.01)
     with pytest.raises(ia.ConfigError, match="focus cannot be learned: give some of focus_nm"):
@@ -209,14 +211,8 @@ def test_a_phase_that_the_line_of_masses_turns_is_told(
 ) -> None:
     """Beyond focus particles are bright; the control is on the configured side."""
     images, _, _ = make_particle_images({"focus_nm": focus_nm}, 16, seed=3)
-    monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
-    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (images, []))
-    config = _config("auto").model_copy(
-        update={"calibration": Calibration(gradient_per_kda=-3.1e-5)}
-    )
-    camera = camera_from_config(config.camera, (64, 64), "uint16")
-    learned, summary, findings = learn_optics(MOVIE, config, camera)
-    said = [finding.text for finding in findings]
+    line = {"calibration": Calibration(gradient_per_kda=-3.1e-5)}
+    learned, summary, said = _learned(monkeypatch, _config("auto").model_copy(update=line), images)
     phase = learned.optics.reference_phase_deg
     assert summary["calibrated"]
     assert abs(learned.optics.focus_nm - focus_nm) < 50
@@ -309,12 +305,8 @@ def test_particles_at_heights_of_their_own_do_not_condemn_the_optics(
     config = _config("auto")
     free = config.model_copy(update={"fit": config.fit.model_copy(update={"mode": mode})})
     images, _, _ = make_particle_images({"focus_nm": -450.0}, 8, seed=3)
-    monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
-    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (images, []))
-    camera = camera_from_config(config.camera, (64, 64), "uint16")
-    assert learn_optics(MOVIE, free, camera) == (free, {}, ())
-    control = learn_optics(MOVIE, config, camera)  # one height for all
-    assert control.findings[0].kind is OPTICS_LEARNED
+    assert _learned(monkeypatch, free, images) == (free, {}, [])
+    assert "learned" in _learned(monkeypatch, config, images)[2][0]  # control: one height for all
 
 
 @pytest.mark.parametrize(

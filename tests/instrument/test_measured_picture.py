@@ -14,7 +14,7 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import conditional
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.instrument.particle_image import ParticleImage, goodness, place_particle_images
-from iscat_analysis.instrument.template import fit_own, fit_picture
+from iscat_analysis.instrument.template import PictureFitter, fit_own
 from iscat_analysis.optics.forward import (
     ForwardModel,
     PixelGrid,
@@ -111,7 +111,8 @@ def test_a_template_describes_what_the_model_does_not() -> None:
     masses = size * rng.choice([0.5, 1.0, 1.5], 44)
     images = place_particle_images(_particle_images(truth, masses, 6), nominal)
     made, held = images[:30], images[30:]
-    found = fit_picture(made, nominal, roi_nm=ROI, step_nm=_step(), level=False)
+    fitter = PictureFitter(nominal, roi_nm=ROI, step_nm=_step(), level=False)
+    found = fitter.fit(made)
     assert found.template.sights == 30
     assert np.abs(found.template.contrast).max() == pytest.approx(1.0, abs=0.05)
     model = with_template(nominal, found.template)

@@ -12,7 +12,7 @@ from iscat_analysis.config import config_to_toml, parse_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.laws import CONDITIONAL, POISSON, NoiseLaw
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.instrument.joint_fit import _Point, _walls, maximise
+from iscat_analysis.instrument.joint_fit import JointLikelihood, maximise
 from iscat_analysis.instrument.measure import search_starts
 from iscat_analysis.instrument.particle_image import PRIVATE, ParticleImage, average_particle_images
 from iscat_analysis.optics.parameters import free_groups, optics_limits, settings_of, with_settings
@@ -66,7 +66,7 @@ def test_private_unknowns_are_eliminated_exactly(heights_nm: tuple[float, float]
     settings = settings_of(configuration())
     private = np.array([image.private for image in images])
     private[:, 3] = 6000.0
-    at = _Point.evaluate(images, build, settings, NAMES, private, _walls(images), map)
+    at = JointLikelihood(images, build, NAMES).at(settings, private)
     k, n = len(NAMES), len(images)
     whole = np.zeros((k + PRIVATE * n, k + PRIVATE * n))
     whole[:k, :k] = at.fisher[:, :k, :k].sum(axis=0)
@@ -87,14 +87,15 @@ def test_score_is_the_slope_of_the_joint_likelihood() -> None:
     private = np.array([image.private for image in images])
     private[:, 3] = 6000.0
 
-    def at(name: str, change: float) -> _Point:
-        moved = {**settings, name: settings[name] + change}
-        return _Point.evaluate(images, build, moved, NAMES, private, _walls(images), map)
-
-    middle = at("z7", 0.0)
+    joint = JointLikelihood(images, build, NAMES)
+    middle = joint.at(settings, private)
     for index, name in enumerate(NAMES):
         step = {"na": 1e-5}.get(name, 1e-2)
-        slope = (at(name, step).value - at(name, -step).value) / (2 * step)
+        below, above = (
+            joint.at({**settings, name: settings[name] + change}, private).value
+            for change in (-step, step)
+        )
+        slope = (above - below) / (2 * step)
         assert slope == pytest.approx(middle.score[:, index].sum(), rel=2e-4), name
 
 

@@ -36,7 +36,7 @@ def test_pictures_that_pass_alone_reject_the_optics_together(changes: dict[str, 
     assert median > REJECTED_P
     assert found.rejected
     ((name, value),) = changes.items()
-    index = found.names.index(name)
+    index = list(found.values).index(name)
     sigma = np.sqrt(found.covariance[index, index])
     assert abs(found.change[index] - (value - settings_of(configuration())[name])) < 4 * sigma
 
@@ -47,7 +47,7 @@ def test_right_optics_are_confirmed_and_what_is_not_told_keeps_its_usual_error()
         found, _ = _tested({}, seed)
         assert not found.rejected
         assert found.log_bayes_factor < 0
-        left = dict(zip(found.names, np.diag(found.posterior) / prior, strict=True))
+        left = dict(zip(found.values, np.diag(found.posterior) / prior, strict=True))
         assert 0.3 < left.pop("na") < 1.0
         assert max(left.values()) < 0.25
 
@@ -56,7 +56,7 @@ def test_without_pictures_optics_have_their_usual_errors() -> None:
     found, _ = _tested({}, 0, 0)
     assert not found.rejected
     assert found.log_bayes_factor == 0
-    focus = found.names.index("focus_nm")
+    focus = list(found.values).index("focus_nm")
     assert np.sqrt(found.posterior[focus, focus]) == pytest.approx(150.0)
 
 
