@@ -62,9 +62,6 @@ from iscat_analysis.records import BoolArray, Box, Candidate, FitResult, FloatAr
 
 IntArray = NDArray[np.int64]
 
-_MAXIMA, _HEIGHTS = 4, 3
-"""Maxima of a scan of diameters that are followed, and heights of each frame at each of them."""
-
 UNDETERMINED = 0.5
 """Error of n − n_s, over its size, from which the index is not told."""
 
@@ -138,11 +135,11 @@ class SphereFrames:
             ]
         )
         found: list[CommonSize] = []
-        for (k,) in highest_maxima(scans.max(axis=2).sum(axis=0), _MAXIMA):
+        for (k,) in highest_maxima(scans.max(axis=2).sum(axis=0), 4):
             starts = [
                 (f, [*places[f, :2], heights[at]])
                 for f, scan in enumerate(scans[:, k])
-                for (at,) in highest_maxima(scan, _HEIGHTS)
+                for (at,) in highest_maxima(scan, 3)
             ]
             frames, rows = (np.array(each) for each in zip(*starts, strict=True))
             best = max((one.log_likelihood for one in found if one.converged), default=-math.inf)

@@ -102,8 +102,6 @@ the end of a calibration's line, before the fit is said to be at a bound: fewer 
 AMPLITUDE = 3
 """Index of the amplitude in θ."""
 
-_NOTHING_KNOWN = np.zeros((5, 5))  # information where nothing was looked at
-
 
 def window_nm(pixel_nm: float) -> float:
     """How far x and y may move from the start of a fit."""
@@ -297,7 +295,8 @@ def _optima(likelihood: Likelihood, theta: FloatArray, box: Box) -> tuple[list[O
     sized = isinstance(model, SizedModel) and bool(box.free[AMPLITUDE])
     for begin, value in starts_of(likelihood, theta, box):
         if box.free[AMPLITUDE] and begin[AMPLITUDE] == 0.0 and best > 0.0:
-            optima.append(Optimum(begin, value, 0, False, _NOTHING_KNOWN))  # no particle there
+            # no particle there
+            optima.append(Optimum(begin, value, 0, False, np.zeros((5, 5))))
             continue
         found = _follow(likelihood, _inside(begin, box), box, best)
         optima.append(found)

@@ -23,8 +23,6 @@ TOLERANCE = 2e-4
 PASSES = 60
 """Evaluations that a fit may take."""
 
-_LARGEST_DAMPING = 1e6
-
 
 @dataclass(frozen=True)
 class Optimum:
@@ -111,7 +109,7 @@ def maximise(
     theta, damping = start.copy(), 0.0
     value, score, fisher = score_fisher(theta)
     used = 1
-    while used < PASSES and math.isfinite(value) and damping <= _LARGEST_DAMPING:
+    while used < PASSES and math.isfinite(value) and damping <= 1e6:
         blocked = ((theta <= box.lower) & (score < 0)) | ((theta >= box.upper) & (score > 0))
         step = step_of(score, fisher, box.free & ~blocked, damping)
         if step is None:

@@ -142,12 +142,11 @@ def _beside(
         return None
     left = fisher[:k, :k] + fisher[:k, k:] @ follow
     unit = 1 / np.sqrt(np.diag(fisher)[:k])
-    if np.linalg.eigvalsh(left * np.outer(unit, unit))[0] <= _DEPENDENT:
+    if np.linalg.eigvalsh(left * np.outer(unit, unit))[0] <= 1e-6:
         return None
     return score[:k] + follow.T @ score[k:], left, follow.T
 
 
-_DEPENDENT = 1e-6
 """Share of a direction's information that is left, below which the fit has it already."""
 
 

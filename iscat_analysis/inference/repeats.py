@@ -207,11 +207,6 @@ SIGNIFICANT = 3.0
 LEAST_EXCESS = 0.02
 """Relative excess below which nothing is said."""
 
-# Growth of the excess from half a window to a whole one, above which it is a drift
-_LEAST_DRIFT_GROWTH = 4.0
-_FEWEST_TILES = 6
-_FEWEST_COUNTS = 200
-
 
 @dataclass(frozen=True)
 class EmpiricalSpread:
@@ -252,7 +247,8 @@ class EmpiricalSpread:
             near, far = (max(self.by_frames[k] ** 2 - self.fast2, 1e-3) for k in (0, -1))
             return far / near > self.frames[-1] / self.frames[0] > 1
         halves, whole = (self.empty[k] ** 2 for k in (-2, -1))
-        return (whole - self.fast2) / max(halves - self.fast2, 1e-3) > _LEAST_DRIFT_GROWTH
+        # a drift grows by more from half a window to a whole one
+        return (whole - self.fast2) / max(halves - self.fast2, 1e-3) > 4.0
 
     @property
     def exceeds(self) -> bool:
@@ -340,7 +336,7 @@ class _Tiles:
         if squares is None or counts is None:
             return None
         held = counts[0] > 0
-        if held.sum() < _FEWEST_TILES or counts[0].sum() < _FEWEST_COUNTS:
+        if held.sum() < 6 or counts[0].sum() < 200:
             return None
         return cls(squares[:, held], counts[:, held], shared)
 

@@ -69,8 +69,6 @@ SAME_NM = 800.0
 
 _KNOWN_APART_NM = (APART_NM, 1600.0, 1300.0, 1000.0, 700.0)
 
-_PARTS = 8  # of a movie, that are searched where all of it is asked for
-
 
 @dataclass(frozen=True)
 class Recording:
@@ -130,7 +128,7 @@ def landing_particle_images(
     parts = [part for chunk in plan_parts(reader, config, window) for part in chunk]
     most = enough = MOST_IMAGES if rings else TESTED
     if whole:
-        chosen = np.linspace(0, len(parts) - 1, min(len(parts), _PARTS)).round().astype(int)
+        chosen = np.linspace(0, len(parts) - 1, min(len(parts), 8)).round().astype(int)
         parts = [parts[k] for k in chosen]
         most = math.ceil(MOST_IMAGES / len(parts))
     bright: list[BrightStep] = []
@@ -372,8 +370,8 @@ def scan_particle_images(recording: Recording) -> Images:
                     model, grid, frame, level, level, extra_variance_e2=read[cut], masked=masked
                 )
             seen.append(replace(_centred(likelihood, config), focus_steps=float(index)))
-        places, weights = [(s.x_nm, s.y_nm) for s in seen], [s.snr**2 for s in seen]
-        x_nm, y_nm = np.average(places, axis=0, weights=weights).tolist()
+        centres, weights = [(s.x_nm, s.y_nm) for s in seen], [s.snr**2 for s in seen]
+        x_nm, y_nm = np.average(centres, axis=0, weights=weights).tolist()
         images += [replace(image, x_nm=x_nm, y_nm=y_nm) for image in seen]
     return _bright(images)
 

@@ -384,9 +384,6 @@ def _scores(
     return terms.value + image.baseline, scored.sum(axis=1), weighted @ rows.T, scored @ scored.T
 
 
-_NEIGHBOUR_PASSES = 6
-
-
 @dataclass(frozen=True)
 class Neighbours:
     """Particles with the rings that they make in one microscope."""
@@ -406,9 +403,7 @@ class Neighbours:
         """Fit them, and once more among each other's rings."""
 
         def own(images: Images) -> Images:
-            return maximise(
-                images, build, settings, (), passes=_NEIGHBOUR_PASSES, mapper=mapper
-            ).images
+            return maximise(images, build, settings, (), passes=6, mapper=mapper).images
 
         first = cls(own(with_masses(others, build, settings)), build_wide(settings))
         return cls(own(first.around(first.particles, mapper)), first.wide)

@@ -105,12 +105,6 @@ that are not alone do not suffice."""
 _STARTS_NM = tuple(range(-400, 401, 100))  # along each axis; rings are some 200 nm apart
 
 
-_CLEAR = 10.0  # standard errors of χ² by which a wrong microscope would be seen in a picture
-
-
-_DESCRIBED = 0.1  # of that, which a picture that is described has at most
-
-
 class _AsConfigured(NamedTuple):
     """The configured microscope, in which the brightest particles are fitted."""
 
@@ -213,8 +207,9 @@ def not_alone(
     if not poor.any() or poor.all():
         return [], float(np.median(p))
     expected = float(np.median((chi2 - 1)[poor] / mass[poor] ** 2)) * mass**2
-    clear = expected > _CLEAR * np.sqrt(2 / math.prod(some[0].grid.shape))
-    described = ~poor & clear & (chi2 - 1 < _DESCRIBED * expected)
+    # in standard errors of χ²
+    clear = expected > 10.0 * np.sqrt(2 / math.prod(some[0].grid.shape))
+    described = ~poor & clear & (chi2 - 1 < 0.1 * expected)
     # of the pictures, that must be described where others are not
     if described.sum() < max(2, 0.25 * len(some)):
         return [], float(np.median(p))
@@ -324,9 +319,6 @@ def _alternative(information: FloatArray, asks: FloatArray) -> tuple[float, floa
     return gain, max(float(change @ information @ change), 0.0)
 
 
-_MANY = 4  # particles alone, with fewer of which a field is looked at as a whole
-
-
 _MOST_STEP_NM = 5e3  # farther than the model's pictures reach
 
 
@@ -335,7 +327,6 @@ NOISE = "its noise is not what the camera's numbers predict"
 
 
 _NOT_TESTED = "the optics cannot be tested on this movie"
-_STUCK = 0.02  # share of frames that repeat another, which sums of frames count
 
 
 class Learned(NamedTuple):
@@ -460,7 +451,7 @@ def tested_optics(recording: Recording) -> Tested:
     for rings in (False, True) if sliding and auto else (True,):
         images, others = bright_particle_images(recording, rings=rings)
         alone = len(images)
-        if alone < _MANY and way == "fixed":
+        if alone < 4 and way == "fixed":  # then the field is looked at as a whole
             windows, movie = recording.summed(), recording.movie
             if drift_warning(movie.name, examine_background(movie, recording.camera, windows)):
                 raise DataError("the edges of a fixed pattern that moved look like particles")
@@ -627,7 +618,8 @@ def noise_differs(recording: Recording) -> bool:
     slides = background_mode(config) == "sliding"
     follows = config.background.follows_pattern if slides else None
     noise = judge_counts(counts[well_lit(light) & ~repeats], camera, follows=follows)
-    return bool((not slides and repeats.mean() > _STUCK) or noise.differs)
+    # sums of frames count a frame that repeats another
+    return bool((not slides and repeats.mean() > 0.02) or noise.differs)
 
 
 def _verdict(tested: Tested | None) -> str:

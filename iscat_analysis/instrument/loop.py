@@ -68,22 +68,7 @@ STEP_FACTORS = (0.5, 2.0)
 _FOCUS_MOVES_NM = tuple(FOCUS_STEP_NM * i for i in (0, -1, 1, -2, 2, -3, 3))
 
 
-_TURNS = 2  # of heights of neighbours, and of their rings
-
-
 _OPTICS_PASSES = 8
-
-
-_LEADERS = 2  # microscopes that are followed beside the configured one,
-
-
-_FOLLOWED = 3  # for so many rounds,
-
-
-_CLEAR = 1.0  # unless one describes the pictures to so many standard errors of one picture's χ²
-
-
-_ODD_SIGMAS = 5.0
 
 
 def fit_optics(
@@ -171,7 +156,7 @@ def _on_the_pixel(search: OpticsSearch, config: Config, measured: Measured) -> t
     engraved, values = search.configured["na"], estimate.values
     apart = values["na"] - engraved
     # between the aperture of an objective and what is engraved on it
-    if abs(apart) < max(0.02, _ODD_SIGMAS * math.sqrt(estimate.covariance[k, k])):
+    if abs(apart) < max(0.02, 5 * math.sqrt(estimate.covariance[k, k])):
         return ()
     most = (values["na"] / engraved) ** 2  # apertures change by half of what pixels do, or more
     reach = max(1.0, most) * max(map(reach_nm, estimate.images))
@@ -214,15 +199,16 @@ def _likeliest(seen: Collected, search: OpticsSearch) -> _Begun:
     build_wide = rings_of(seen.config, seen.images[0])
     lights = ("linear", "circular") if "polarization" in groups else (known["polarization"],)
     focus_moves = _FOCUS_MOVES_NM if "focus" in groups else (0.0,)
-    # a focus and heights that are one fringe off describe the pictures nearly as well
-    clear = 1 + _CLEAR * math.sqrt(2 / math.prod(seen.images[0].grid.shape))
+    # to a standard error of one picture's χ²: a focus and heights that are one fringe off describe
+    # the pictures nearly as well
+    clear = 1 + math.sqrt(2 / math.prod(seen.images[0].grid.shape))
 
     def placed(settings: Settings, some: Images, around: Images, moved: float = 0.0) -> _Begun:
         model, wide = search.build(settings), build_wide(settings)
         fringe = model.fringe_nm
         anywhere = [moved + fringe * k for k in (-1.0, -0.5, 0.0, 0.5, 1.0)]
         near = _best_heights(around, anywhere, model, settings, search.mapper)[0]
-        for _ in range(_TURNS if near else 0):  # each among all, whose rings other heights change
+        for _ in range(2 if near else 0):  # each among all, whose rings other heights change
             among = Neighbours(near, wide).around(near, search.mapper)
             shifts = [-fringe, 0.0, fringe]
             near = _best_heights(among, shifts, model, settings, search.mapper)[0]
@@ -241,9 +227,9 @@ def _likeliest(seen: Collected, search: OpticsSearch) -> _Begun:
         tried.append(placed(there, seen.images, seen.others, moved))
     tried.sort(key=lambda begun: begun.misfit)
     first = next(begun for begun in tried if begun.settings["focus_nm"] == known["focus_nm"])
-    leaders = [first, *(begun for begun in tried[:_LEADERS] if begun is not first)]
+    leaders = [first, *(begun for begun in tried[:2] if begun is not first)]
     for begun in leaders:
-        for _ in range(_FOLLOWED):
+        for _ in range(3):
             begun = better(begun)
             tried.append(begun)
             if begun.misfit < clear:
@@ -278,12 +264,6 @@ def _best_heights(
 
 SETTLED = 1.0
 """Standard errors that are still to come, below which no other round is made."""
-
-
-_MOST_SHARE = 0.8
-
-
-_FARTHEST = 0.7  # times the last change that is added to it: some directions change back then
 
 
 class PictureSource(Protocol):
@@ -409,7 +389,7 @@ class Rounds:
         if square == 0:
             return None
         turned = float(moved @ weight @ changed)
-        return min(max(1 + turned / square, 0.0), _MOST_SHARE)
+        return min(max(1 + turned / square, 0.0), 0.8)
 
     @property
     def to_come(self) -> FloatArray:
@@ -433,7 +413,8 @@ class Rounds:
             return last.ahead
         values, optics = settings_of(last.ahead), last.ahead.optics
         limits = optics_limits(optics.n_immersion, optics.n_glass)
-        ahead = min(self.share / (1 - self.share), _FARTHEST) * last.step
+        # no farther: some directions change back then
+        ahead = min(self.share / (1 - self.share), 0.7) * last.step
         for name, change in zip(last.found.names, ahead.tolist(), strict=True):
             ends = limits.get(name, (-np.inf, np.inf))
             values[name] = float(np.clip(values[name] + change, *ends))

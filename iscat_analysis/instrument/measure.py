@@ -57,9 +57,6 @@ _LOOKED_FOR = ("focus_nm", "reference_phase_deg")
 _TURNS = 24  # of half a circle of phases, for strong particles
 
 
-_FAINT = 1e-3  # share of what is explained below which the scattered light alone is left out
-
-
 _DIRECTIONS_DEG = (45.0, 90.0, 135.0)
 
 
@@ -156,7 +153,8 @@ def _best_phase(
     linear = np.einsum("ij,jyx->iyx", np.linalg.pinv(gram[:2, :2]), overlaps[:2])
     explained = np.einsum("iyx,iyx->yx", linear, overlaps[:2])
     amplitude, phase = np.hypot(*linear), np.arctan2(linear[1], linear[0])
-    if amplitude.max() ** 4 * gram[2, 2] < _FAINT * explained.max():
+    # the scattered light alone is left out where it explains so little
+    if amplitude.max() ** 4 * gram[2, 2] < 1e-3 * explained.max():
         return amplitude, phase, explained
     turns = np.concatenate(
         [np.pi * np.arange(_TURNS)[:, None, None] / _TURNS * np.ones_like(phase), phase[None]]
@@ -201,8 +199,6 @@ HELD_OUT_P = 1e-3
 
 
 _TRIAL_PASSES = 12  # of a second microscope on all pictures, and of one with fewer aberrations
-_FIRST_PASSES, _MORE_PASSES = 6, 10  # of all starts, and of those that lead then
-_LEADERS = 2  # beside the best of every state
 _HOPELESS = 0.03  # share of the log-likelihood by which a state lags that is given up
 _MASKS_NA = (0.35, 0.65)
 _FINER_MASKS_NA = (0.35, 0.5, 0.65, 0.8, 1.0)
@@ -473,10 +469,10 @@ class OpticsSearch:
         def first(start: Start) -> Estimate:
             x, y, mass = start.x_nm, start.y_nm, start.mass_kda
             there = [replace(one, x_nm=x, y_nm=y, mass_kda=mass) for one in averages]
-            return fit(there, start.values, _FIRST_PASSES)
+            return fit(there, start.values, 6)
 
         def more(found: Estimate) -> Estimate:
-            return found if found.converged else fit(found.images, found.values, _MORE_PASSES)
+            return found if found.converged else fit(found.images, found.values, 10)
 
         def is_behind(found: Estimate) -> bool:
             light = found.values["polarization"]
@@ -488,7 +484,7 @@ class OpticsSearch:
         leading = [
             found
             for rank, found in enumerate(fits)
-            if rank < _LEADERS
+            if rank < 2
             or (
                 not any(same_state(found, better) for better in fits[:rank])
                 and found.log_posterior > (1 - _HOPELESS) * fits[0].log_posterior

@@ -148,12 +148,6 @@ def models_of(images: Images, build: Build, settings: Settings) -> list[ForwardM
 UNIT_KDA = 1e3  # at which interference and scattered light are told apart, by their powers
 
 
-_ROUNDS = 3  # of registration
-
-
-_PARTS = 20  # of a pixel, to which it is found
-
-
 FARTHEST_CENTRE_PX = 4.0  # a picture's first centre is off by no more
 
 
@@ -240,7 +234,7 @@ def _average(images: Images) -> tuple[ParticleImage, Images]:
     shifts = np.array([image.offset_nm for image in images]) / pixel
     template = ndimage.shift(contrasts[0], -shifts[0], order=3, mode="nearest")
     variance = np.full(template.shape, float(np.median(variances[0])))
-    for _ in range(_ROUNDS if len(images) > 1 else 0):
+    for _ in range(3 if len(images) > 1 else 0):
         total, weight = np.zeros_like(template), np.zeros_like(template)
         for index, (contrast, noise) in enumerate(zip(contrasts, variances, strict=True)):
             shifts[index] = _register(contrast, template, shifts[index])
@@ -272,9 +266,7 @@ def _register(contrast: FloatArray, template: FloatArray, shift: FloatArray) -> 
     """
     from skimage.registration import phase_cross_correlation  # only the learner needs it
 
-    found, *_ = phase_cross_correlation(
-        template, contrast, normalization=None, upsample_factor=_PARTS
-    )
+    found, *_ = phase_cross_correlation(template, contrast, normalization=None, upsample_factor=20)
     near = np.abs(found + shift).max() <= FARTHEST_CENTRE_PX
     return np.asarray(-found if near else shift)
 

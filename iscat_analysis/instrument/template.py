@@ -211,12 +211,8 @@ def _alone(images: Images, others: Images) -> Images:
     return [image for image in images if is_alone(image)]
 
 
-_ROUNDS = 8
-_SETTLED = 0.1  # change of the picture, over its noise, at which rounds end
 _FADE_NM = 250.0  # beyond the pictures the template fades to nothing
 _ROAM_NM = 400.0  # along x and y, in the fit of one picture
-_LEAST = 1e-4  # of its variance, relative to that of the centre
-_FINE = 8  # points per step of the lattice, where the peak is looked for
 
 
 @dataclass(frozen=True)
@@ -301,7 +297,7 @@ class PictureFitter:
         coefficients = np.zeros(2 * waves.qx.size - 1)
         prior = np.eye(coefficients.size)
         used, moved = 0, math.inf
-        while used < _ROUNDS and moved > _SETTLED:
+        while used < 8 and moved > 0.1:  # of its noise
             used, before = used + 1, coefficients
             coefficients, covariance, effective = self._step(own, waves, coefficients, prior)
             coefficients, shift, size = _gauge(waves, coefficients, side / 2, self.step_nm, own)
@@ -416,7 +412,7 @@ def _prior(
     # width of the rings on which the prior is told
     ring = np.rint(np.hypot(axis[:, None], axis).ravel() / 150.0).astype(int)
     mean = np.bincount(ring, energy) / np.maximum(np.bincount(ring), 1)
-    fading = np.maximum.accumulate(np.maximum(mean, _LEAST * mean.max())[::-1])[::-1]
+    fading = np.maximum.accumulate(np.maximum(mean, 1e-4 * mean.max())[::-1])[::-1]
     spread = np.sqrt(fading / fading[0])[ring]
     back = basis.T * np.where(np.arange(coefficients.size) == 0, 1.0, 2.0)[:, None] / ring.size
     return np.asarray((back * spread) @ basis)
@@ -433,7 +429,7 @@ def _gauge(
     centred = waves.moved(coefficients, x, y)
     pattern = (waves.on(axis, axis, None) @ centred).reshape(axis.size, axis.size)
     row, column = np.unravel_index(int(np.argmax(np.abs(pattern))), pattern.shape)
-    fine = step_nm * np.linspace(-1, 1, 2 * _FINE + 1)
+    fine = step_nm * np.linspace(-1, 1, 17)  # where the peak is looked for
     near = waves.on(axis[column] + fine, axis[row] + fine, None) @ centred
     size = float(np.abs(near).max())
     if sum(math.copysign(1.0, image.mass_kda) for image in images) < 0:

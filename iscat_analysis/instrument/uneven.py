@@ -73,8 +73,6 @@ HELD_OUT_GAIN = 4.0
 
 _SHARED = ("focus_nm", "reference_phase_deg")  # free beside a change before optics are learned
 _SIDE = 2  # pictures on either side of a jump
-_BLOCKS, _BLOCK = 6, 4  # parts of a movie with a focus of their own, and least pictures of one
-_PASSES = 10
 
 
 @dataclass(frozen=True)
@@ -231,7 +229,7 @@ class _ScoreTests:
 
     def rest(self) -> list[Change]:
         """Say whether parts of the movie ask for a focus of their own."""
-        number = min(_BLOCKS, len(self.images) // _BLOCK)
+        number = min(6, len(self.images) // 4)  # of parts, of four pictures or more
         if not self.view.in_time or number < 2:
             return []
         order = np.argsort([image.shown for image in self.images])
@@ -328,8 +326,6 @@ def is_plausible(terms: Mapping[str, float], frames: tuple[int, int]) -> bool:
 
 _ENDS = 16  # frames at either end, which show the light before and after
 _LOOKED_AT = 256  # frames between them
-_DARK = 0.5  # of the brightest frame, below which one shows no light
-_CORE_NM = 350.0  # from the middle of a picture: what lands beside it changes little of that
 
 
 def jump_frame(view: FieldOfView, images: Images, between: tuple[int, int]) -> int:
@@ -343,7 +339,7 @@ def jump_frame(view: FieldOfView, images: Images, between: tuple[int, int]) -> i
     last, first = (order[k] for k in between)
     low = max(round(last.frames[0]) - _ENDS, view.frames[0])
     high = min(round(2 * first.frames[1] - first.step) + _ENDS, view.frames[1])
-    reach = round(_CORE_NM / view.pixel_nm)
+    reach = round(350.0 / view.pixel_nm)  # what lands beside a particle changes little of that
     places = []
     for image in (image for image in order if image.step < low):
         y, x = (round(at / view.pixel_nm) for at in (image.y_nm, image.x_nm))
@@ -383,7 +379,7 @@ def _lit(movie: Stack, frames: NDArray[np.int64]) -> tuple[NDArray[np.int64], Fl
     """Read frames, and leave out those without light; each over its mean; shape (t, y, x)."""
     light = np.array([movie.read(frame, frame + 1)[0] for frame in frames.tolist()], dtype=float)
     level = light.mean(axis=(1, 2))
-    lit = level > _DARK * level.max()
+    lit = level > 0.5 * level.max()
     return frames[lit], light[lit] / level[lit, None, None]
 
 
@@ -402,7 +398,7 @@ def in_uneven_field(
     pictures: Images = sorted(view.placed(signed), key=lambda image: -image.snr)
 
     def fitted(some: Images, start: Settings, names: Sequence[str]) -> Estimate:
-        return maximise(some, build, start, names, prior=prior, passes=_PASSES, mapper=mapper)
+        return maximise(some, build, start, names, prior=prior, passes=10, mapper=mapper)
 
     def tried(pictures: Images, start: Settings, names: Sequence[str]) -> tuple[Settings, float]:
         """Fit all parts of the pictures but one, which is judged, in turns."""
