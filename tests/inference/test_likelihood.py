@@ -88,8 +88,20 @@ def _poisson(case: Case, seed: int = 1, *, per_pixel: float = 1e5, **options) ->
     return noise.poisson(case.model, GRID, counts, background, scale, **options)
 
 
-def _any(kind: str, case: Case, seed: int = 1, **options) -> Likelihood:
-    return {"conditional": _conditional, "poisson": _poisson}[kind](case, seed, **options)
+def _any(kind: str, case: Case, reads: tuple[float, float] | None = None, **options) -> Likelihood:
+    """Give one of both, with variances of what was read before and after."""
+    if kind == "poisson":
+        return _poisson(case, extra_variance_e2=sum(reads or (0.0,)), **options)
+    return _conditional(case, read_variances_e2=reads or (0.0, 0.0), **options)
+
+
+def _slopes(which: Likelihood, theta: np.ndarray, steps: np.ndarray, of: int) -> np.ndarray:
+    """Differentiate the value (0) or the score (1) along θ, by four points."""
+    out = []
+    for step in np.diag(steps)[: np.count_nonzero(steps)]:
+        at = [which.score_fisher(theta + k * step)[of] for k in (-2, -1, 1, 2)]
+        out.append((at[0] - 8 * at[1] + 8 * at[2] - at[3]) / (12 * step.sum()))
+    return np.array(out)
 
 
 def _thetas(case: Case, count: int = 6) -> np.ndarray:
@@ -159,50 +171,29 @@ def test_score_pass_and_batch_agree_on_the_value(kind: str, name: str, request) 
         assert value == pytest.approx(which.values(theta[None])[0], rel=1e-6, abs=1e-4)
 
 
-STEPS = np.array([0.02, 0.02, 0.02, np.nan, 1e-5])
-
-
 def _steps(case: Case) -> np.ndarray:
-    steps = STEPS.copy()
-    steps[3] = 1e-4 * case.theta[3]
-    return steps
+    return np.array([0.02, 0.02, 0.02, 1e-4 * case.theta[3], 1e-5])
 
 
 @pytest.mark.parametrize("read", [0.0, 4e4])
 @pytest.mark.parametrize(("kind", "name"), CASES)
 def test_score_is_the_gradient(kind: str, name: str, read: float, request) -> None:
     case = request.getfixturevalue(name)
-    option = "extra_variance_e2" if kind == "poisson" else "read_variances_e2"
-    which = _any(kind, case, **{option: read if kind == "poisson" else (0.0, read)})
+    which, steps = _any(kind, case, (0.0, read)), _steps(case)
     for theta in _thetas(case, 3):
         _, score, fisher = which.score_fisher(theta)
-        for i, h in enumerate(_steps(case)):
-            step = np.zeros(5)
-            step[i] = h
-            values = [which.score_fisher(theta + k * step)[0] for k in (-2, -1, 1, 2)]
-            slope = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * h)
-            rounding = 1e-9 / h  # rounding of the sum
-            assert abs(slope - score[i]) < rounding + NUMERICAL * (
-                abs(score[i]) + np.sqrt(fisher[i, i])
-            )
+        near = 1e-9 / steps + NUMERICAL * (np.abs(score) + np.sqrt(np.diag(fisher)))  # and rounding
+        assert np.all(np.abs(_slopes(which, theta, steps, 0) - score) < near)
 
 
 @pytest.mark.parametrize("read", [0.0, 4e4])
 @pytest.mark.parametrize(("kind", "name"), CASES)
 def test_observed_information_is_the_hessian(kind: str, name: str, read: float, request) -> None:
     case = request.getfixturevalue(name)
-    option = "extra_variance_e2" if kind == "poisson" else "read_variances_e2"
-    which = _any(kind, case, **{option: read if kind == "poisson" else (read, 0.0)})
-    theta = _thetas(case, 1)[0]
+    which, theta = _any(kind, case, (read, 0.0)), _thetas(case, 1)[0]
     observed = observed_information(which, theta)
     np.testing.assert_allclose(observed, observed.T, rtol=1e-12)
-    steps = _steps(case)
-    numerical = np.empty((5, 5))
-    for i in range(5):
-        step = np.zeros(5)
-        step[i] = steps[i]
-        plus, minus = which.score_fisher(theta + step)[1], which.score_fisher(theta - step)[1]
-        numerical[i] = -(plus - minus) / (2 * steps[i])
+    numerical = -_slopes(which, theta, _steps(case), 1)
     size = np.sqrt(np.diag(which.score_fisher(theta)[2]))
     scale = np.outer(size, size)
     np.testing.assert_allclose(observed / scale, numerical / scale, atol=NUMERICAL)
@@ -268,12 +259,11 @@ def _score_pulls(
     theta = case.theta * np.array([1, 1, 1, 1, 0])
     pulls = np.empty((trials, 5))
     for k in range(trials):
-        before = rng.poisson(n_before * light) + np.sqrt(
-            n_before
-        ) * read_noise_e * rng.standard_normal(GRID.shape)
-        after = rng.poisson(n_after * light * (1 + signal)) + np.sqrt(
-            n_after
-        ) * read_noise_e * rng.standard_normal(GRID.shape)
+        before, after = (
+            rng.poisson(n * light * bright)
+            + np.sqrt(n) * read_noise_e * rng.normal(size=GRID.shape)
+            for n, bright in ((n_before, 1.0), (n_after, 1 + signal))
+        )
         if kind == "conditional":
             which = noise.conditional(
                 case.model, GRID, before, after, n_after / n_before,
@@ -322,13 +312,9 @@ def test_dark_field_with_nothing_behind_it(dark: Case) -> None:
     assert (counts == 0).any()
     which = noise.poisson(dark.model, GRID, counts, 0.0, scale)
     value, score, fisher = which.score_fisher(theta)
-    for i, h in enumerate(_steps(dark)[:4]):
-        step = np.zeros(5)
-        step[i] = h
-        values = [which.score_fisher(theta + k * step)[0] for k in (-1, 1)]
-        assert score[i] == pytest.approx(
-            (values[1] - values[0]) / (2 * h), abs=1e-4 * np.sqrt(fisher[i, i])
-        )
+    unit = np.sqrt(np.diag(fisher))[:4]
+    slopes = _slopes(which, theta, _steps(dark) * [1, 1, 1, 1, 0], 0)
+    np.testing.assert_allclose(slopes / unit, score[:4] / unit, atol=1e-4)
     other = theta * np.array([1, 1, 1, 1.1, 1])
     expected = sum(
         sign * poisson.logpmf(counts, scale * dark.model.image(GRID, *t[:4])).sum()
@@ -360,9 +346,6 @@ def test_a_masked_pixel_says_nothing(kind: str, weak: Case) -> None:
     assert np.isnan(with_mask.measured_signal()[masked]).all()
     assert (with_mask.signal_information()[masked] == 0).all()
     assert np.isfinite(observed_information(with_mask, weak.theta)).all()
-
-
-# ---- what the images are made of ----------------------------------------------------------------
 
 
 # ---- interpolation along z --------------------------------------------------------------------
