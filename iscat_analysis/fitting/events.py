@@ -126,6 +126,7 @@ def region_likelihood(
     middle = (float(np.mean(grid.x_nm)), float(np.mean(grid.y_nm)))
     model = context.model_at(*middle) if near else context.wide
     before, after, masked = windows.before_e[cut], windows.after_e[cut], windows.masked[cut]
+    reads = windows.read_variance_before_e2[cut], windows.read_variance_after_e2[cut]
     return counts_likelihood(
         model, grid, before, after, windows.power_ratio,
         background=context.background_variance,
@@ -136,9 +137,7 @@ def region_likelihood(
         ),
         scale_e=photons_scale(context, windows) if context.additive else None,
         others=others,
-        read_variances_e2=(
-            windows.read_variance_before_e2[cut], windows.read_variance_after_e2[cut]
-        ),
+        read_variances_e2=reads,
         masked=masked,
     )  # fmt: skip
 

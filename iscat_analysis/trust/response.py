@@ -27,9 +27,7 @@ COMMON = (*PARAMETERS, "contrast")
 """What such errors are told of; of the contrast where it is the result, without a calibration."""
 
 _AMPLITUDES = 4  # at which the response to the optics is computed, for the span of all events
-_FAINT = 1e-6  # peak contrast of a particle whose scattered light alone is nothing
 _XX, _YY = 5, 7  # rows of second derivatives
-_KNOWN = 1e-12  # of the prior's variance, below which an error is none
 
 
 class Shifts(NamedTuple):
@@ -115,7 +113,7 @@ class Response:
     @property
     def faint_amplitude(self) -> float:
         """Amplitude of a particle whose scattered light alone is negligible."""
-        return _FAINT / peak_per_amplitude(self.model)
+        return 1e-6 / peak_per_amplitude(self.model)
 
     def to_input(
         self,
@@ -159,7 +157,7 @@ class Response:
         Shapes: `information` (k, k), `wrong` (k,), result (k,).
         """
         both = np.outer(self.prior, self.prior)
-        left = np.clip(np.linalg.eigvalsh(self.posterior / both), _KNOWN, 1.0)
+        left = np.clip(np.linalg.eigvalsh(self.posterior / both), 1e-12, 1.0)
         gained = -float(np.log(left).sum())
         values, vectors = np.linalg.eigh(information * both)
         values = np.maximum(values, 0.0)
