@@ -32,7 +32,7 @@ from scipy.special import i0, j0, j1
 
 from iscat_analysis._kernels import FAST, AnyFloatArray, ComplexArray, FloatArray, IntArray, kernel
 from iscat_analysis._kernels.lens import LatticeLens, Pixels
-from iscat_analysis._kernels.loops import lines_apart, mix, mix_both, within
+from iscat_analysis._kernels.loops import mix, mix_both, within
 from iscat_analysis._kernels.radial import fill_quintics
 
 LATTICE_STEP = 1.2
@@ -364,6 +364,25 @@ def node_rows(lens: LatticeLens, pixels: Pixels, y_p: float) -> tuple[int, int]:
     return first, last + TAPS - first
 
 
+@kernel(fastmath=FAST, _nrt=False)
+def _blend(nodes: FloatArray, row: int, first: int, w: FloatArray, out: FloatArray) -> None:
+    """Fill `out` (n) with the combination w of TAPS rows of `nodes`, from a column on."""
+    for k in range(0, TAPS, 4):
+        a, b = nodes[row + k, first:], nodes[row + k + 1, first:]
+        c, d = nodes[row + k + 2, first:], nodes[row + k + 3, first:]
+        mix(a, b, c, d, w, k, out)
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def _blend_both(
+    nodes: FloatArray, row: int, w: FloatArray, out: FloatArray, other: FloatArray
+) -> None:
+    """Fill `out` and `other` with two combinations w (2, TAPS) of the same rows."""
+    for k in range(0, TAPS, 4):
+        a, b, c, d = nodes[row + k], nodes[row + k + 1], nodes[row + k + 2], nodes[row + k + 3]
+        mix_both(a, b, c, d, w, k, out, other)
+
+
 @kernel()
 def _locate(lens: LatticeLens, away: float, w: FloatArray) -> int:
     """Fill the weights of the nodes at a distance from the particle; give the first of them."""
@@ -383,13 +402,10 @@ def _columns(
     written once.
     """
     rows, columns = out.shape
-    side = plane.shape[1]
-    nodes, at = plane.reshape(plane.size), lines_apart(side, TAPS)
     for start in range(0, columns, STRIP):
         count = min(STRIP, columns - start)
         for j in range(count):
-            begin = left[start + j] * side + first
-            mix(nodes[begin:], at, weights[start + j], strip[j])
+            _blend(plane, left[start + j], first, weights[start + j], strip[j])
         for r in range(rows):
             for j in range(count):
                 out[r, start + j] = strip[j, r]
@@ -458,22 +474,21 @@ def lattice_row(
     """Fill `out` with signal and gradient (5, nx) of one row, or its signal alone (1, nx)."""
     first, rows = node_rows(lens, pixels, theta[1])
     gradient, w = len(out) > 1, np.empty((2, TAPS))
-    width, q, columns = 2 * lens.components, pixels.offsets.size, out.shape[1]
-    nodes, at = f.reshape(f.size), lines_apart(columns, TAPS)
-    apart = width * rows * columns
+    width, q = 2 * lens.components, pixels.offsets.size
+    apart = width * rows
     out[:] = 0.0
     for i in range(q):
         top = _locate(lens, pixels.y[row] + pixels.offsets[i] - theta[1], w) - first
         for sample in range(q):
-            start = (FIELDS + sample * (3 if gradient else 1) * width * rows + top) * columns
+            start = FIELDS + sample * (3 if gradient else 1) * apart + top
             for k in range(width):
-                here = start + k * rows * columns
+                here = start + k * rows
                 if not gradient:
-                    mix(nodes[here:], at, w[0], f[k])
+                    _blend(f, here, 0, w[0], f[k])
                     continue
-                mix_both(nodes[here:], at, w, f[k], f[3 * MOST + k])
-                mix(nodes[here + apart :], at, w[0], f[MOST + k])
-                mix(nodes[here + 2 * apart :], at, w[0], f[2 * MOST + k])
+                _blend_both(f, here, w, f[k], f[3 * MOST + k])
+                _blend(f, here + apart, 0, w[0], f[MOST + k])
+                _blend(f, here + 2 * apart, 0, w[0], f[2 * MOST + k])
             weight = pixels.weights[i] * pixels.weights[sample]
             for c in range(lens.components):
                 rho = lens.rho if c == 0 else 0.0
@@ -505,7 +520,6 @@ def lattice_values(
     first, rows = node_rows(lens, pixels, theta[1])
     columns, channels, a = pixels.x.size, stack.shape[0], theta[3]
     across = interpolate_columns(stack, lens, pixels, theta, channels, 0)
-    nodes, at = across.reshape(across.size), lines_apart(columns, TAPS)
     w, f = np.empty((1, TAPS)), np.empty((channels, columns))
     out[:] = 0.0
     for row in range(pixels.y.size):
@@ -514,7 +528,7 @@ def lattice_values(
             for sample in range(pixels.offsets.size):
                 for k in range(channels):
                     start = FIELDS + (sample * channels + k) * rows + top
-                    mix(nodes[start * columns :], at, w[0], f[k])
+                    _blend(across, start, 0, w[0], f[k])
                 weight = pixels.weights[i] * pixels.weights[sample]
                 for c in range(components):
                     rho = lens.rho if c == 0 else 0.0

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels import FAST, AnyFloatArray, FloatArray, IntArray, kernel
+from iscat_analysis._kernels import FAST, FloatArray, IntArray, kernel
 
 
 @kernel(_nrt=False)
@@ -59,51 +59,40 @@ def marked(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
     return out[:count]
 
 
-@kernel()
-def lines_apart(width: int, count: int) -> IntArray:
-    """Give where some lines of a width begin, one after the other."""
-    at = np.empty(count, dtype=np.int64)
-    for k in range(count):
-        at[k] = k * width
-    return at
+@kernel(forceinline=True, fastmath=FAST)
+def mix(
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, w: FloatArray, k: int,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """Fill `out` with the combination of four arrays by w[k…k + 3], or add it where k > 0.
 
-
-@kernel(fastmath=FAST, _nrt=False)
-def mix(nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, out: AnyFloatArray) -> None:
-    """Fill `out` with the combination w of the lines that begin at some places of `nodes` (n).
-
-    Four lines at a time: with more arrays that might overlap, the compiler uses no vectors.
+    With more arrays that might overlap, the compiler uses no vectors.
     """
-    n = out.size
-    for k in range(0, at.size, 4):
-        a, b, c, d = nodes[at[k] :], nodes[at[k + 1] :], nodes[at[k + 2] :], nodes[at[k + 3] :]
-        wa, wb, wc, wd = w[k], w[k + 1], w[k + 2], w[k + 3]
-        if k == 0:
-            for j in range(n):
-                out[j] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
-        else:
-            for j in range(n):
-                out[j] += wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
+    wa, wb, wc, wd = w[k], w[k + 1], w[k + 2], w[k + 3]
+    if k == 0:
+        for j in range(out.size):
+            out[j] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
+    else:
+        for j in range(out.size):
+            out[j] += wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
 
 
-@kernel(fastmath=FAST, _nrt=False)
+@kernel(forceinline=True, fastmath=FAST)
 def mix_both(
-    nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, out: AnyFloatArray, other: AnyFloatArray
-) -> None:
-    """Fill `out` and `other` with two combinations w (2, lines) of the same lines; see `mix`."""
-    n = out.size
-    for k in range(0, at.size, 4):
-        a, b, c, d = nodes[at[k] :], nodes[at[k + 1] :], nodes[at[k + 2] :], nodes[at[k + 3] :]
-        wa, wb, wc, wd = w[0, k], w[0, k + 1], w[0, k + 2], w[0, k + 3]
-        va, vb, vc, vd = w[1, k], w[1, k + 1], w[1, k + 2], w[1, k + 3]
-        if k == 0:
-            for j in range(n):
-                out[j] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
-                other[j] = va * a[j] + vb * b[j] + vc * c[j] + vd * d[j]
-        else:
-            for j in range(n):
-                out[j] += wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
-                other[j] += va * a[j] + vb * b[j] + vc * c[j] + vd * d[j]
+    a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, w: FloatArray, k: int,
+    out: FloatArray, other: FloatArray,
+) -> None:  # fmt: skip
+    """Fill `out` and `other` with two combinations w (2, n) of the same arrays; see `mix`."""
+    wa, wb, wc, wd = w[0, k], w[0, k + 1], w[0, k + 2], w[0, k + 3]
+    va, vb, vc, vd = w[1, k], w[1, k + 1], w[1, k + 2], w[1, k + 3]
+    if k == 0:
+        for j in range(out.size):
+            out[j] = wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
+            other[j] = va * a[j] + vb * b[j] + vc * c[j] + vd * d[j]
+    else:
+        for j in range(out.size):
+            out[j] += wa * a[j] + wb * b[j] + wc * c[j] + wd * d[j]
+            other[j] += va * a[j] + vb * b[j] + vc * c[j] + vd * d[j]
 
 
 LEAST = 1e-13

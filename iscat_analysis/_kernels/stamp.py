@@ -110,6 +110,24 @@ def _copy_nodes(
                 s[j] = p[j] + a * q[j]
 
 
+@kernel(fastmath=FAST, _nrt=False)
+def _mix(nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, out: AnyFloatArray) -> None:
+    """Fill `out` with the combination w of the lines that begin at TAPS places of `nodes`."""
+    for k in range(0, TAPS, 4):
+        a, b, c, d = nodes[at[k] :], nodes[at[k + 1] :], nodes[at[k + 2] :], nodes[at[k + 3] :]
+        mix(a, b, c, d, w, k, out)
+
+
+@kernel(fastmath=FAST, _nrt=False)
+def _mix_both(
+    nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, out: AnyFloatArray, other: AnyFloatArray
+) -> None:
+    """Fill `out` and `other` with two combinations of the same nodes; see `_mix`."""
+    for k in range(0, TAPS, 4):
+        a, b, c, d = nodes[at[k] :], nodes[at[k + 1] :], nodes[at[k + 2] :], nodes[at[k + 3] :]
+        mix_both(a, b, c, d, w, k, out, other)
+
+
 @kernel(_nrt=False)
 def _make_strip(
     profile: AnyFloatArray, lens: StampLens, row: int, rows: int, columns: int,
@@ -142,26 +160,26 @@ def _make_strip(
             )  # fmt: skip
         here = sums[phase * made :]
         if images == _SIGNAL:
-            mix(nodes, at, weights[1, 0], here[:used])
+            _mix(nodes, at, weights[1, 0], here[:used])
             continue
-        mix_both(nodes, at, weights[1], here[:used], here[size : size + used])
+        _mix_both(nodes, at, weights[1], here[:used], here[size : size + used])
         for k in range(2, 1 + images // 2):
             order, doubled = _ALONG_Y[k]
             made_y = here[k * size : k * size + used]
-            mix(nodes[kept * doubled :], at, weights[1, order], made_y)
+            _mix(nodes[kept * doubled :], at, weights[1, order], made_y)
     phase = left % fine
     for k in range(TAPS):
         at[k] = (phase + k) % fine * made + (phase + k) // fine
     out: int = _WEIGHTS + 2 * fine * block + (1 + images // 2) * size
     made_images, used = w[out:], used - (line - columns)
     if images == _SIGNAL:
-        mix(sums, at, weights[0, 0], made_images[:used])
+        _mix(sums, at, weights[0, 0], made_images[:used])
         return out
-    mix_both(sums, at, weights[0], made_images[:used], made_images[strip : strip + used])
+    _mix_both(sums, at, weights[0], made_images[:used], made_images[strip : strip + used])
     for k in range(2, images):
         source, order = _ALONG_X[k]
         made_x = made_images[k * strip : k * strip + used]
-        mix(sums[source * size :], at, weights[0, order], made_x)
+        _mix(sums[source * size :], at, weights[0, order], made_x)
     return out
 
 
