@@ -24,8 +24,8 @@ def make_rows(
 ) -> pd.DataFrame:
     """Make a table of rows, with the order and the types of the registry of columns.
 
-    Values that a row lacks stay empty.  The table has an optional column if a row has it, and the
-    number of the event once it is given.  `columns` are added to the rows.
+    Values that a row lacks stay empty, whole numbers included.  The table has an optional column if
+    a row has it, and the number of the event once it is given.  `columns` are added to the rows.
     """
     whole = isinstance(lines, (pd.DataFrame, Mapping))
     table = pd.DataFrame(lines if whole else list(lines)).reset_index(drop=True)
@@ -40,9 +40,8 @@ def make_rows(
     ]
     types = {column.name: column.dtype for column in kept}
     table = table.reindex(columns=list(types))
-    if table["frame"].isna().any():  # sums do not say when
-        types["frame"] = "Int64"
-    return table.astype(types)
+    empty = table.columns[table.isna().any()]
+    return table.astype(types | {name: "Int64" for name in empty if types[name] == "int64"})
 
 
 def with_diameters(table: pd.DataFrame, density_kg_m3: float) -> pd.DataFrame:

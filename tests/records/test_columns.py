@@ -49,10 +49,13 @@ def test_a_row_has_its_number_once_it_is_given() -> None:
     assert list(make_rows(lines, {"event": [4, 5]})["event"]) == [4, 5]
 
 
-def test_sums_do_not_say_when() -> None:
-    table = make_rows([LINE | {"frame": None}])
-    assert str(table["frame"].dtype) == "Int64"
-    assert table["frame"].isna().all()
+def test_whole_numbers_that_a_row_lacks_stay_empty() -> None:
+    table = make_rows([LINE | {"frame": None}, LINE | {"track": 4}])
+    assert [str(table[name].dtype) for name in ("frame", "track", "n_before")] == ["Int64"] * 2 + [
+        "int64"
+    ]
+    assert list(table["track"].isna()) == [True, False]
+    assert table.loc[1, "track"] == 4
 
 
 def test_a_column_that_is_not_registered_is_refused() -> None:
