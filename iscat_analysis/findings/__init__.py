@@ -6,14 +6,16 @@ that stand in the sentence.  One place prints them, the page sorts them by sever
 ``summary.json`` lists them with their values, so that a program can act on a code.
 """
 
-from iscat_analysis.findings import camera, files, optics, particles, results, setup, tables, tracks  # noqa: F401
-from iscat_analysis.findings.registry import KINDS as KINDS
-from iscat_analysis.findings.registry import Finding as Finding
-from iscat_analysis.findings.registry import FindingKind as FindingKind
-from iscat_analysis.findings.registry import Findings as Findings
-from iscat_analysis.findings.registry import Severity as Severity
-from iscat_analysis.findings.registry import Value as Value
-from iscat_analysis.findings.registry import existing as existing
-from iscat_analysis.findings.registry import printing as printing
-from iscat_analysis.findings.registry import unreported as unreported
-from iscat_analysis.findings.registry import warnings_in as warnings_in
+from iscat_analysis.findings import camera, files, optics, particles, results, setup, tables, tracks
+from iscat_analysis.findings.registry import (
+    KINDS,
+    Finding,
+    FindingKind,
+    Findings,
+    Severity,
+    Value,
+    existing,
+    printing,
+    unreported,
+    warnings_in,
+)
