@@ -226,7 +226,10 @@ def takes(keywords: type) -> Callable[[F], F]:
 
         @wraps(work)
         def run(*given: Any, **options: Any) -> Any:
-            signature.bind(*given, **options)
+            try:
+                signature.bind(*given, **options)
+            except TypeError as error:
+                raise TypeError(f"{work.__name__}() {error}") from None
             return work(*given, **defaults(keywords) | options)
 
         vars(run)["__signature__"] = signature
