@@ -434,12 +434,13 @@ def identified(rows: Localizations, *, near_nm: float, error: float) -> Localiza
     meetings = _meetings(rows, near_nm)
     latest = np.full(len(track), -1)  # meeting of each row
     for k, met in enumerate(meetings):
-        latest[met] = k
+        latest[met.rows] = k
     for k, met in enumerate(meetings):
-        labels, later = np.unique(track[met]), latest > k
+        labels = np.unique(track[met.rows])
+        later = latest > k
         sides = [_track_side(rows, track, one, met, later, typical) for one in labels[labels >= 0]]
         for path in _chains(sides, typical):
-            _continue_chain(rows, track, path)
+            _continue_chain(rows, track, path, met)
     group = rows.group.copy()
     for one in np.unique(track[track != rows.track]):  # the blur that most rows of it have
         group[track == one] = np.bincount(rows.group[track == one]).argmax()
@@ -522,6 +523,13 @@ def _normal(off: float, variance: float) -> float:
     return -(off**2 / variance + math.log(variance)) / 2
 
 
+class _Meeting(NamedTuple):
+    """Rows of the tracks that met, and their pairs, the closest first."""
+
+    rows: IntArray
+    pairs: IntArray
+
+
 @dataclass(frozen=True, eq=False)
 class _Side:
     """A track in a meeting: its parts before and after, and whether it begins or ends there."""
@@ -539,14 +547,14 @@ def _track_side(
     rows: Localizations,
     track: IntArray,
     one: int,
-    met: IntArray,
+    met: _Meeting,
     later: BoolArray,
     typical: _Typical,
 ) -> _Side:
     """Summarise one track of a meeting; `later` are the rows of the meetings that follow."""
     mine = np.flatnonzero(track == one)
     frame = rows.frame[mine]
-    first, last = rows.frame[met[track[met] == one]][[0, -1]].tolist()
+    first, last = rows.frame[met.rows[track[met.rows] == one]][[0, -1]].tolist()
     until = frame[later[mine] & (frame > last)].min(initial=int(frame[-1]) + 1)
     before = typical.part(rows, mine[frame < first])
     after = typical.part(rows, mine[(frame > last) & (frame < until)])
@@ -582,14 +590,17 @@ def _chains(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
         yield path
 
 
-def _continue_chain(rows: Localizations, track: IntArray, path: list[_Side]) -> None:
+def _continue_chain(rows: Localizations, track: IntArray, path: list[_Side], met: _Meeting) -> None:
     """Give each track of a chain the rows that the next one has after the meeting.
 
-    All are cut at one frame, in the middle of the time in which all are there.
+    All are cut at one frame, that in which the tracks were closest.
     """
     numbers = [side.track for side in path]
     mine = [np.flatnonzero(track == k) for k in numbers]
-    cut = (max(side.first for side in path) + min(side.last for side in path)) // 2
+    low, high = max(side.first for side in path), min(side.last for side in path)
+    near = rows.frame[met.pairs[np.isin(track[met.pairs], numbers).all(axis=1), 0]]
+    near = near[(near >= low) & (near <= high)]
+    cut = int(near[0]) if near.size else (low + high) // 2
     cycle = path[0] is path[-1]
     end = int(rows.frame[mine[0][-1]]) if path[0].ends and not cycle else -1
     begin = rows.frame[mine[-1][0]] if path[-1].begins and not cycle else rows.frame[-1] + 1
@@ -615,14 +626,18 @@ class _Pair(NamedTuple):
     rows: IntArray
 
 
-def _meetings(rows: Localizations, near_nm: float) -> list[IntArray]:
-    """Join close pairs into meetings, rows of tracks that met, sorted by frame."""
+def _meetings(rows: Localizations, near_nm: float) -> list[_Meeting]:
+    """Join close pairs into meetings, sorted by frame."""
     pairs = _pairs(rows, near_nm)
     number = np.arange(len(pairs))
     for one, two in _of_one(rows, pairs):
         number[number == number[two]] = number[one]
-    each = ([pairs[i].rows for i in np.flatnonzero(number == k)] for k in np.unique(number))
-    return sorted((np.unique(np.concatenate(met)) for met in each), key=lambda met: int(met[0]))
+    out = []
+    for k in np.unique(number):
+        met = np.concatenate([pairs[i].rows for i in np.flatnonzero(number == k)])
+        apart = np.hypot(*(rows.theta[met[:, 0], :2] - rows.theta[met[:, 1], :2]).T)
+        out.append(_Meeting(np.unique(met), met[np.argsort(apart)]))
+    return sorted(out, key=lambda met: int(met.rows[0]))
 
 
 def _of_one(rows: Localizations, pairs: list[_Pair]) -> Iterator[tuple[int, int]]:
