@@ -215,8 +215,9 @@ def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
 
 def as_diameters(table: pd.DataFrame) -> pd.DataFrame:
     """Put the diameters of spheres in the place of their masses."""
-    masses = [name for name in table if str(name).endswith("_mass_kda")]
-    sizes = {name: table[name.replace("mass_kda", "diameter_nm")] for name in masses}
+    kinds = ("sigma", "crb", "qcrb", "systematic")
+    names = [name for kind in kinds if (name := f"{kind}_mass_kda") in table]
+    sizes = {name: table[name.replace("mass_kda", "diameter_nm")] for name in names}
     return table.assign(**sizes, mass_kda=table["diameter_nm"])
 
 

@@ -436,7 +436,7 @@ def test_the_scattering_length_of_a_small_sphere_is_that_of_its_polarisability()
 def test_no_error_of_a_mass_is_shown_as_that_of_a_diameter() -> None:
     kinds = ("sigma", "crb", "qcrb", "systematic")
     columns = {f"{kind}_mass_kda": [3e3] for kind in kinds} | {"mass_kda": [1e5]}
-    counted = {"frame": [0], "n_before": [9], "n_after": [9]}
+    counted = {"frame": [0], "n_before": [9], "n_after": [9], "repeat_mass_kda": [3e3]}
     table = with_diameters(pd.DataFrame(columns | counted), 2200.0)
     shown = as_diameters(table)
     for kind in kinds:  # 3 % of a mass is 1 % of a diameter
