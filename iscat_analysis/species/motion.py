@@ -367,6 +367,7 @@ def most_likely_power(track: Displacements, free: float) -> Fractional:
         ln_d = (here.slope[0] - known[0, 1] * alpha) / known[0, 0]
         step = np.array([np.clip(ln_d, low[0] - at[0], high[0] - at[0]), alpha])
         if here.slope @ step < _SETTLED:
+            at = at + step
             break
         there = likelihood_at(track, lags, at + step)
         while not there.value > here.value and np.abs(step).max() > _NO_STEP:

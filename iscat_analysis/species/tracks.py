@@ -611,15 +611,15 @@ def _diffusion(placed: TrackRows, setup: TrackSetup) -> tuple[Diffusion, Displac
     whole = gather(
         *placed.positions(), frame_rate_hz=setup.frame_rate_hz, exposure_ms=setup.exposure_ms
     )
-    room, counted = _room(placed, setup)[:-1], whole
+    room, inside = _room(placed, setup)[:-1], whole.counted
     for _ in range(_DISPLACEMENT_PASSES):
+        counted = replace(whole, counted=inside)
         reach = _STEPS * np.sqrt(2 * counted.best_nm2_s * whole.gaps_s)
         inside = np.flatnonzero(room > reach)
         if inside.size < least - 1:
             return None
         if np.array_equal(inside, counted.counted):
             break
-        counted = replace(whole, counted=inside)
     return diffusion_of(counted, COVERAGE), whole
 
 
