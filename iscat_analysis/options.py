@@ -212,7 +212,7 @@ def defaults(keywords: type) -> Any:
 
 def takes(keywords: type) -> Callable[[F], F]:
     """Give a function with ``**options`` the keywords of a group, with their defaults."""
-    known = options_of(keywords)
+    known, usual = options_of(keywords), defaults(keywords)
 
     def expanded(work: F) -> F:
         declared = inspect.signature(work)
@@ -230,7 +230,7 @@ def takes(keywords: type) -> Callable[[F], F]:
                 signature.bind(*given, **options)
             except TypeError as error:
                 raise TypeError(f"{work.__name__}() {error}") from None
-            return work(*given, **defaults(keywords) | options)
+            return work(*given, **usual | options)
 
         vars(run)["__signature__"] = signature
         about = inspect.cleandoc(work.__doc__ or "").replace("**options", _described(known))

@@ -613,7 +613,7 @@ def _diffusion(placed: TrackRows, setup: TrackSetup) -> tuple[Diffusion, Displac
     )
     room, inside = _room(placed, setup)[:-1], whole.counted
     for _ in range(_DISPLACEMENT_PASSES):
-        counted = replace(whole, counted=inside)
+        counted = whole if inside is whole.counted else replace(whole, counted=inside)
         reach = _STEPS * np.sqrt(2 * counted.best_nm2_s * whole.gaps_s)
         inside = np.flatnonzero(room > reach)
         if inside.size < least - 1:
