@@ -17,17 +17,16 @@ import typer
 from typer.core import TyperCommand
 
 from iscat_cli import INTERRUPTED
+from iscat_cli.answers import kd, species
 from iscat_cli.bounds import bounds
 from iscat_cli.calibrate import SUMMARY as CALIBRATE_SUMMARY
 from iscat_cli.calibrate import camera, mass, optics
 from iscat_cli.console import UNEXPECTED, Messages, silence
 from iscat_cli.day import batch, watch
 from iscat_cli.fit import fit
-from iscat_cli.kd import kd
 from iscat_cli.options import Command
 from iscat_cli.results import app, export, view
 from iscat_cli.setup import config, init
-from iscat_cli.species import species
 from iscat_cli.study import SUMMARY as CHALLENGE_SUMMARY
 from iscat_cli.study import benchmark, make, score, simulate
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import typer
 
 from iscat_cli import INTERRUPTED
+from iscat_cli.answers import upper_end
 from iscat_cli.console import Messages, listing, short
-from iscat_cli.kd import upper_end
 from iscat_cli.options import MovieSetup, Printed, command, numbers, parsed, two_numbers
 
 if TYPE_CHECKING:

@@ -190,11 +190,12 @@ def benchmark(
         return
     if output.out is None:
         raise ConfigError("--out is missing: give the folder that is to be written")
-    from iscat_contest.benchmark import check_benchmark_output, run_benchmark, write_benchmark
-    from iscat_contest.publish import write_archive
+    from iscat_analysis.report import BENCHMARK_NAMES
+    from iscat_contest.benchmark import run_benchmark, write_benchmark
+    from iscat_contest.scoring import write_archive
 
     others = estimators.found()
-    check_benchmark_output(output.out, output.overwrite)
+    output.check(BENCHMARK_NAMES)
     how: Any = {"time_limit_s": estimators.time_limit, "command": messages.command}
     with messages.progress() as progress:
         study = run_benchmark(
@@ -381,7 +382,7 @@ def _publish(
 ) -> None:
     """Print scores, and write their page and archive."""
     from iscat_analysis.errors import ConfigError
-    from iscat_contest.publish import write_archive, write_scores
+    from iscat_contest.scoring import write_archive, write_scores
 
     lines: list[RenderableType] = [_scores_table(scores)]
     if output.out is not None:

@@ -34,21 +34,3 @@ from iscat_analysis.calibration.line import (
     standards_of,
     with_standards,
 )
-
-__all__ = [
-    "LEAST_EVENTS",
-    "STANDARD_ERROR",
-    "ContrastPeak",
-    "Landing",
-    "Line",
-    "MassCalibration",
-    "as_given",
-    "calibrate_mass",
-    "contrast_over",
-    "find_contrast_peaks",
-    "line_sigma_kda",
-    "mass_from_contrast",
-    "standards_of",
-    "with_standards",
-    "york_line",
-]

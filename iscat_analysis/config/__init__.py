@@ -12,7 +12,6 @@ from __future__ import annotations
 from iscat_analysis.config.analysis import (
     BackgroundConfig,
     Calibration,
-    Compute,
     Detection,
     Fit,
     StandardsCamera,
@@ -53,7 +52,6 @@ from iscat_analysis.config.synthetic import SIMULATED, SimulatedMover, Simulatio
 from iscat_analysis.config.values import (
     ALL,
     LARGEST_NM,
-    PIXEL_NM,
     WAVELENGTH_NM,
     Mode,
     Scheme,

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt, model_validator
+from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt
 
 from iscat_analysis.config.instrument import MEASURABLE, Optics, OpticsCovariance
 from iscat_analysis.config.kinds import METHODS, MODES, ModeKind, Way
@@ -90,24 +91,20 @@ class BackgroundConfig(Section):
         """Frames that were recorded before the particles; None if there are none."""
         return None if isinstance(self.frames, str) else self.frames
 
-    @model_validator(mode="after")
-    def _consistent(self) -> BackgroundConfig:
+    def _refusals(self) -> Iterator[str]:
         if self.frames == ALL and self.method not in (None, "median", "fixed"):
-            raise ValueError(
+            yield (
                 'frames = "all" is for method = "median" or "fixed", the median or the mean of all '
                 f'frames, and method is "{self.method}": set one of these, or leave frames out'
             )
         if self.is_known and self.level_e is None:
-            raise ValueError('method = "known" needs level_e, the known background level')
+            yield 'method = "known" needs level_e, the known background level'
         if self.frames is not None and self.method and not METHODS[self.method].takes_frames:
             does = {
                 "sliding": "compares every frame with its neighbours",
                 "tracks": "learns the background from the frames in which the particles are",
             }[self.method]
-            raise ValueError(
-                f'method = "{self.method}" {does}: leave frames out, or set method = "fixed"'
-            )
-        return self
+            yield f'method = "{self.method}" {does}: leave frames out, or set method = "fixed"'
 
 
 class Detection(Section):
@@ -161,13 +158,11 @@ class Fit(Section):
     nm of lipids around water), "gold", "silica", "polystyrene", "sphere" (of an index that is
     fitted), or an index; []: nothing is tried"""
 
-    @model_validator(mode="after")
-    def _range(self) -> Fit:
-        if not self.z_range_nm[0] < self.z_range_nm[1]:
-            raise ValueError(f"z_range_nm = {list(self.z_range_nm)} is empty")
-        if not self.diameter_range_nm[0] < self.diameter_range_nm[1]:
-            raise ValueError(f"diameter_range_nm = {list(self.diameter_range_nm)} is empty")
-        return self
+    def _refusals(self) -> Iterator[str]:
+        for name in ("z_range_nm", "diameter_range_nm"):
+            low, high = getattr(self, name)
+            if not low < high:
+                yield f"{name} = {[low, high]} is empty"
 
     @property
     def kind(self) -> ModeKind:
@@ -326,18 +321,16 @@ class Calibration(Section):
     optics_assumed: bool = False
     """true: the optics are not known; those configured are assumed"""
 
-    @model_validator(mode="after")
-    def _usable(self) -> Calibration:
+    def _refusals(self) -> Iterator[str]:
         if self.gradient_per_kda == 0:
-            raise ValueError("gradient_per_kda = 0 says nothing about mass")
+            yield "gradient_per_kda = 0 says nothing about mass"
         least, most = CONTRAST_PER_KDA
         if not least <= abs(self.gradient_per_kda) <= most:
-            raise ValueError(
+            yield (
                 f"gradient_per_kda = {self.gradient_per_kda:g} is not between {least:g} and "
                 f"{most:g}: give contrast per kDa, as -3.1e-5, not in per cent or ppm, nor per "
                 "Da or MDa"
             )
-        return self
 
 
 def _measurable(errors: dict[str, float]) -> dict[str, float]:

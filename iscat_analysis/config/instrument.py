@@ -150,22 +150,20 @@ class OpticsCovariance(Section):
         matrix = tuple(tuple(self.matrix[i][k] for k in kept) for i in kept)
         return OpticsCovariance(names=tuple(self.names[k] for k in kept), matrix=matrix)
 
-    @model_validator(mode="after")
-    def _symmetric(self) -> OpticsCovariance:
+    def _refusals(self) -> Iterator[str]:
         size = len(self.names)
         known = (*MEASURABLE, *FIELD_TERMS, *MOVES)
         unknown = [name for name in self.names if name not in known]
         if unknown:
-            raise ValueError(f"names has {unknown[0]}, which is none of {', '.join(known)}")
+            yield f"names has {unknown[0]}, which is none of {', '.join(known)}"
         if [len(row) for row in self.matrix] != [size] * size:
-            raise ValueError(f"matrix needs {size} rows of {size} numbers, one for each of names")
+            yield f"matrix needs {size} rows of {size} numbers, one for each of names"
         for i, j in product(range(size), repeat=2):
             row, other = self.matrix[i], self.matrix[j]
             if abs(row[j] - other[i]) > 1e-6 * math.sqrt(abs(row[i] * other[j])):
-                raise ValueError(f"matrix is not symmetric in {self.names[i]}, {self.names[j]}")
+                yield f"matrix is not symmetric in {self.names[i]}, {self.names[j]}"
             if row[i] < 0:
-                raise ValueError(f"matrix gives {self.names[i]} a negative variance")
-        return self
+                yield f"matrix gives {self.names[i]} a negative variance"
 
 
 Index = Annotated[Positive, AfterValidator(refractive_index)]
@@ -315,12 +313,6 @@ class Optics(FieldTerms):
             return {"emission": "dong2021", **values}
         return values
 
-    @model_validator(mode="after")
-    def _possible(self) -> Optics:
-        for refusal in self._refusals():
-            raise ValueError(refusal)
-        return self
-
     def _refusals(self) -> Iterator[str]:
         if self.mask_na >= self.na:
             yield (
@@ -459,12 +451,6 @@ class Particle(Section):
     photons_per_frame: Positive | None = None
     """dark field: scattered photons collected per frame from a particle of this mass; it sets the
     mass scale"""
-
-    @model_validator(mode="after")
-    def _possible(self) -> Particle:
-        for refusal in self._refusals():
-            raise ValueError(refusal)
-        return self
 
     def _refusals(self) -> Iterator[str]:
         if self.permittivity is not None and self.index is not None:

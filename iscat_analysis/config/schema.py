@@ -8,6 +8,7 @@ beside it.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Self
 
 from pydantic import Field, model_validator
 
@@ -51,7 +52,7 @@ class Config(Section):
     compute: Compute = Field(default_factory=Compute)
 
     @model_validator(mode="after")
-    def _resolved(self) -> Config:
+    def _possible(self) -> Self:
         """Choose what is left open, and refuse sections that do not go together.
 
         The model is frozen for its users; here it is still being made.
@@ -69,9 +70,13 @@ class Config(Section):
             self.__dict__["camera"] = camera.model_copy(update=update)
         if self.optics.calibrate == "auto" and self.particle.is_sphere:  # learned from dipoles
             self.__dict__["optics"] = self.optics.model_copy(update={"calibrate": "never"})
-        for refusal in _refusals(self):
+        for refusal in self._refusals():
             raise ValueError(refusal)
         return self
+
+    def _refusals(self) -> Iterator[str]:
+        for part in (_of_background, _of_particle, _of_fit, _of_template):
+            yield from part(self)
 
     @property
     def heights_free(self) -> bool:
@@ -96,14 +101,6 @@ class Config(Section):
 INVISIBLE = 1e-3
 """Relative difference between the indices of a particle and of the sample below which the particle
 is not seen."""
-
-
-def _refusals(config: Config) -> Iterator[str]:
-    """Say why sections do not go together."""
-    yield from _of_background(config)
-    yield from _of_particle(config)
-    yield from _of_fit(config)
-    yield from _of_template(config)
 
 
 def _of_background(config: Config) -> Iterator[str]:

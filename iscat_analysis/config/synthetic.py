@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
-from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
+from pydantic import Field, NonNegativeInt, PositiveInt
 
 from iscat_analysis.config.values import (
     LARGEST_NM,
@@ -22,9 +23,9 @@ Side = Annotated[int, Field(ge=8, le=16_384)]
 Probability = Annotated[float, Field(gt=0, lt=0.5)]
 
 
-def _refuse_early(frame: int, leave: int | None) -> None:
+def _too_early(frame: int, leave: int | None) -> Iterator[str]:
     if leave is not None and leave <= frame:
-        raise ValueError(f"leave = {leave} must come after frame = {frame}")
+        yield f"leave = {leave} must come after frame = {frame}"
 
 
 class SimulatedEvent(Section):
@@ -43,10 +44,8 @@ class SimulatedEvent(Section):
     mass_kda: Positive | None = None
     """default particle.mass_kda"""
 
-    @model_validator(mode="after")
-    def _leaves_later(self) -> SimulatedEvent:
-        _refuse_early(self.frame, self.leave)
-        return self
+    def _refusals(self) -> Iterator[str]:
+        return _too_early(self.frame, self.leave)
 
 
 class SimulatedMover(Section):
@@ -79,23 +78,21 @@ class SimulatedMover(Section):
     y_px: Finite | None = None
     """row at first, downwards"""
 
-    @model_validator(mode="after")
-    def _possible(self) -> SimulatedMover:
+    def _refusals(self) -> Iterator[str]:
         if self.mass_kda is not None and self.diameter_nm is not None:
-            raise ValueError("give mass_kda or diameter_nm, not both")
-        _refuse_early(self.frame, self.leave)
+            yield "give mass_kda or diameter_nm, not both"
+        yield from _too_early(self.frame, self.leave)
         if (self.x_px is None) != (self.y_px is None):
-            raise ValueError("give x_px and y_px, or neither")
+            yield "give x_px and y_px, or neither"
         if self.x_px is not None and self.count != 1:
-            raise ValueError(
+            yield (
                 f"count = {self.count} particles cannot all begin at x_px, y_px: leave the "
                 "position out, or give each particle its own block"
             )
         if self.ceiling_nm is not None and self.space == "membrane":
-            raise ValueError('ceiling_nm needs space = "volume"')
+            yield 'ceiling_nm needs space = "volume"'
         if self.ceiling_nm is not None and (self.z_nm or 0.0) > self.ceiling_nm:
-            raise ValueError(f"z_nm = {self.z_nm:g} lies above ceiling_nm = {self.ceiling_nm:g}")
-        return self
+            yield f"z_nm = {self.z_nm:g} lies above ceiling_nm = {self.ceiling_nm:g}"
 
 
 SIMULATED: dict[str, type[Section]] = {"events": SimulatedEvent, "movers": SimulatedMover}
@@ -134,15 +131,14 @@ class Simulation(Section):
     species: tuple[Positive, ...] | None = None
     """masses [kDa] of the random particles, in equal shares"""
 
-    @model_validator(mode="after")
-    def _either(self) -> Simulation:
+    def _refusals(self) -> Iterator[str]:
         if self.events and self.count is not None:
-            raise ValueError("give events or count, not both")
+            yield "give events or count, not both"
         if self.leavings and (self.count is None or self.leavings > self.count):
-            raise ValueError(f"leavings = {self.leavings} needs a count at least as large")
+            yield f"leavings = {self.leavings} needs a count at least as large"
         moving = sum(mover.count for mover in self.movers)
         if moving * self.frames > _MOST_POSITIONS:
-            raise ValueError(
+            yield (
                 f"{moving} movers in frames = {self.frames} have {moving * self.frames} positions, "
                 f"more than {_MOST_POSITIONS}: simulate fewer, or a shorter movie"
             )
@@ -154,16 +150,15 @@ class Simulation(Section):
         for name, one in particles:
             x, y = one.x_px or 0.0, one.y_px or 0.0
             if not (-0.5 <= y < rows - 0.5 and -0.5 <= x < columns - 0.5):
-                raise ValueError(
+                yield (
                     f"{name} at x_px = {x}, y_px = {y} lies outside the field of {columns} x "
                     f"{rows} pixels"
                 )
             if one.frame >= self.frames:
-                raise ValueError(
+                yield (
                     f"{name} appears at frame {one.frame}, after the {self.frames} frames of the "
                     "movie"
                 )
-        return self
 
 
 class BoundsConfig(Section):

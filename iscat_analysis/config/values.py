@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -13,6 +14,7 @@ from pydantic import (
     Field,
     Tag,
     ValidationError,
+    model_validator,
 )
 
 from iscat_analysis.errors import ConfigError
@@ -175,3 +177,13 @@ class Section(BaseModel, metaclass=_Called):
         """Write descriptions in one line."""
         for field in cls.model_fields.values():
             field.description = " ".join((field.description or "").split())
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        for refusal in self._refusals():
+            raise ValueError(refusal)
+        return self
+
+    def _refusals(self) -> Iterable[str]:
+        """Say why keys do not go together; only the first reason is read."""
+        return ()

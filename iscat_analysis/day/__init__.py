@@ -2,28 +2,47 @@
 
 `table` reads what there is, names the results and resolves the configurations, `calibrate` makes
 the calibrations of the day, `jobs` does one job after another and leaves alone what is finished,
-`gather`, `compare` and `publish` make tables and page of all results, and `watch` follows a folder
-or a movie that grows.
+`gather` and `compare` make tables of all results, and `watch` follows a folder or a movie that
+grows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Unpack
 
+import numpy as np
 import pandas as pd
 
 from iscat_analysis.answers.output import Notify, tell
 from iscat_analysis.calibration.line import with_line
 from iscat_analysis.config import Config, configure
 from iscat_analysis.day.calibrate import Day, calibrate_day
-from iscat_analysis.day.compare import Reaction, kd_name, reaction_of
-from iscat_analysis.day.gather import Found, read_movie
-from iscat_analysis.day.jobs import Outcome, Runner, claim_folder, hash_of
-from iscat_analysis.day.publish import publish_day
+from iscat_analysis.day.compare import (
+    Reaction,
+    Series,
+    find_equilibria,
+    kd_name,
+    kd_table,
+    match_species,
+    reaction_of,
+    shifts,
+)
+from iscat_analysis.day.gather import (
+    MOVIE_COLUMNS,
+    SPECIES_COLUMNS,
+    Found,
+    movie_table,
+    poisson_rate,
+    read_movie,
+    species_table,
+    write_events,
+)
+from iscat_analysis.day.jobs import Outcome, Runner, claim_folder, hash_of, write_whole
 from iscat_analysis.day.table import (
     Movie,
     Plan,
@@ -37,11 +56,15 @@ from iscat_analysis.day.table import (
 )
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.executors import open_executor
+from iscat_analysis.files import whole_file
 from iscat_analysis.inference.checks import path_in, shown
 from iscat_analysis.movie import files_of
 from iscat_analysis.options import DayOptions, takes
 from iscat_analysis.records import Progress, silent
-from iscat_analysis.text import from_table
+from iscat_analysis.report.batch import BatchContents, Curve, batch_page, summary_line
+from iscat_analysis.report.output import atomic_folder
+from iscat_analysis.report.tables import CSV_DIGITS
+from iscat_analysis.text import from_table, in_table
 from iscat_analysis.units import count
 
 __all__ = ["Batch", "Table", "batch", "read_table"]
@@ -307,3 +330,122 @@ def _gathered(
 def _read(path: Path, text: Mapping[str, type[str]]) -> pd.DataFrame:
     """Read a table as it was before it was written; a sample may be called NA."""
     return from_table(pd.read_csv(path, dtype=text, keep_default_na=False, na_values=[""]))
+
+
+_FIGURE = re.compile(r"(overlaid|stacked(_\d+)?|species|shares|rates|kd(_\d+)?)\.(png|svg|pdf)")
+
+
+def publish_day(
+    plan: Plan,
+    day: Day,
+    found: Sequence[Found],
+    reaction: Reaction | None,
+    failed: Sequence[tuple[str, str]],
+    out: Path,
+) -> None:
+    """Write the tables and the page of all movies; each file is written whole or not at all."""
+    movies = movie_table(plan, day, found, out)
+    species = match_species(species_table(found))[list(SPECIES_COLUMNS)]
+    shifted = shifts(species[species["role"] != "calibrant"], reference_of(found))
+    series = [] if reaction is None else find_equilibria(found, reaction)
+    tables = {"movies": movies, "species": species, "shifts": shifted}
+    if reaction is not None:
+        tables["kd"] = kd_table(series, reaction)
+    else:
+        (out / "kd.csv").unlink(missing_ok=True)
+    for name, table in tables.items():
+        text = in_table(table).to_csv(
+            index=False, float_format=f"%.{CSV_DIGITS}g", lineterminator="\n"
+        )
+        write_whole(out / f"{name}.csv", text)
+    with atomic_folder(out / "figures", True, known=_figure_files(out / "figures")) as folder:
+        page = _page(plan, day, found, tables, series, failed, folder)
+    write_whole(out / "batch.html", page)
+    own = movies[list(movies.columns[len(MOVIE_COLUMNS) :])]
+    with whole_file(out / "events.parquet") as partial:
+        write_events(found, own, partial)
+
+
+def _figure_files(folder: Path) -> set[str]:
+    """Name what an earlier batch may have left among the figures."""
+    held = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    return {name for name in held if _FIGURE.fullmatch(name)}
+
+
+def _page(
+    plan: Plan,
+    day: Day,
+    found: Sequence[Found],
+    tables: Mapping[str, pd.DataFrame],
+    series: Sequence[Series],
+    failed: Sequence[tuple[str, str]],
+    folder: Path,
+) -> str:
+    """Make the page, and the figures in a folder."""
+    groups = {each.movie.name: _group(each) for each in found}
+    movies, species = tables["movies"], tables["species"]
+    timed = movies["seconds_searched"].notna() | movies["frames_searched"].isna()
+    per_second = bool(timed.all())
+    exposure = movies["seconds_searched" if per_second else "frames_searched"].to_numpy(float)
+    exposure = exposure if per_second else exposure / 1000
+    counted = zip(movies["landings"].astype(float), exposure, strict=True)
+    rates = [poisson_rate(landings, time) for landings, time in counted]
+    shown = movies.assign(
+        group=[groups[name] for name in movies["movie"]],
+        rate=[rate[0] for rate in rates],
+        rate_from=[rate[1] for rate in rates],
+        rate_to=[rate[2] for rate in rates],
+        rate_unit="second" if per_second else "1000 frames",
+    )
+    shown.attrs["further"] = list(movies.columns[len(MOVIE_COLUMNS) :])
+    scales = {each.summary["mass_scale"] for each in found if each.summary}
+    contents = BatchContents(
+        curves=[_curve(each, groups[each.movie.name]) for each in found],
+        movies=shown,
+        species=species.assign(group=[groups[name] for name in species["movie"]]),
+        shifts=tables["shifts"],
+        equilibria=[
+            (each.condition, each.binding.to_dict(), each.remarks)
+            for each in series
+            if each.binding is not None
+        ],
+        calibrations=_calibrations(day),
+        failed=[*failed, *((kd_name(each.condition), each.why) for each in series if each.why)],
+        mass_label="mass [kDa]" if scales <= {"calibration"} else "mass, model scale [kDa]",
+    )
+    return batch_page(plan.table.title, summary_line(movies), contents, folder)
+
+
+def _calibrations(day: Day) -> list[tuple[str, str, str]]:
+    """Say what was calibrated by what, and where its page is."""
+    camera = "calibration/camera/camera.html" if "camera.gain_e_per_adu" in day.settings else ""
+    mass = "calibration/mass/calibration.html" if "calibration" in day.settings else ""
+    return [
+        ("camera", day.camera, camera),
+        ("optics", day.optics, ""),
+        ("mass scale", day.mass, mass),
+    ]
+
+
+def _group(each: Found) -> str:
+    """Give the panel of a movie: its condition, or its role."""
+    row = each.movie.row
+    return row.condition or (row.role if row.role in ("calibrant", "blank") else "")
+
+
+def _curve(each: Found, group: str) -> Curve:
+    curves = each.distribution.get("curves", {})
+    grid, density = (np.array(curves.get(key, ()), dtype=float) for key in ("mass_kda", "density"))
+    return Curve(
+        each.movie.name, each.movie.row.sample, group, np.abs(each.masses_kda), grid, density
+    )
+
+
+def reference_of(found: Sequence[Found]) -> str:
+    """Name the sample that the others are compared with: the first of the table."""
+    described = (
+        each.movie.row.sample
+        for each in found
+        if each.movie.row.role == "sample" and each.distribution.get("species")
+    )
+    return next(described, "")

@@ -26,19 +26,3 @@ from iscat_analysis.pieces.counts import config_of, gather
 from iscat_analysis.pieces.limits import crb, psf, qcrb
 from iscat_analysis.pieces.regions import LogLikelihood, fit_rois, log_likelihood
 from iscat_analysis.pieces.rods import fit_rods
-
-__all__ = [
-    "Camera",
-    "LogLikelihood",
-    "compile_kernels",
-    "config_of",
-    "crb",
-    "fit_particle",
-    "fit_rods",
-    "fit_rois",
-    "gather",
-    "log_likelihood",
-    "parts_of",
-    "psf",
-    "qcrb",
-]

@@ -25,22 +25,22 @@ if TYPE_CHECKING:
 
 _DOCUMENTS: Mapping[str, str] = {
     "batch": "answers.Batch",
-    "benchmark": "study.Benchmark",
-    "bounds": "bounds.Bounds",
-    "calibration": "calibration.MassCalibration",
-    "camera": "calibration.Camera",
-    "challenge": "study.Challenge",
-    "comparison": "bounds.Comparison",
+    "benchmark": "limits.Benchmark",
+    "bounds": "limits.Bounds",
+    "calibration": "fit.MassCalibration",
+    "camera": "fit.Camera",
+    "challenge": "limits.Challenge",
+    "comparison": "limits.Comparison",
     "fit": "fit.Fit",
     "init": "answers.Init",
     "kd": "answers.Kd",
-    "optics": "calibration.Optics",
-    "optics_bounds": "bounds.OpticsBounds",
+    "optics": "fit.Optics",
+    "optics_bounds": "limits.OpticsBounds",
     "simulate": "fit.Simulate",
     "species": "answers.Species",
     "species_comparison": "answers.SpeciesComparison",
     "summary": "fit.Summary",
-    "template": "calibration.Template",
+    "template": "fit.Template",
 }
 """Model of each document; a model is imported when it is needed, which saves some milliseconds."""
 

@@ -23,9 +23,8 @@ from iscat_contest.challenge import (
     truth_beside,
 )
 from iscat_contest.estimators import find_estimator
-from iscat_contest.publish import write_archive, write_scores
 from iscat_contest.results import Results, match_movie, read_results
-from iscat_contest.scoring import score_challenge
+from iscat_contest.scoring import score_challenge, write_archive, write_scores
 
 PIXEL_NM = 84.4
 STACKS = 24

@@ -23,7 +23,7 @@ from iscat_analysis.study import (
     resamples,
     score_estimates,
 )
-from iscat_contest.compare import draw
+from iscat_contest.benchmark import draw
 from iscat_contest.estimators import (
     BUILT_IN,
     GROUP,
