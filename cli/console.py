@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from iscat_analysis.findings import Finding
     from iscat_analysis.records import Progress
+    from iscat_analysis.report.numbers import Table as Made
 
 UNEXPECTED = 1
 SECONDS_TO_FIRST_LINE = 2.0
@@ -354,6 +355,12 @@ def listing(
     from iscat_analysis.units import cells
 
     return table(*heading.split(" | "), rows=cells(records, row), left=left)
+
+
+def listed(made: Made) -> Table:
+    """Print a table of the reports."""
+    right = [number for number, column in enumerate(made.columns) if not column.numeric]
+    return table(*(column.label for column in made.columns), rows=made.rows, left=right)
 
 
 def grouped(number: float) -> str:

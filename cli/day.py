@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -133,13 +133,17 @@ def _lines(found: Batch, part: tuple[int, int] | None = None) -> Iterator[Render
         yield f"part {part[0]} of {part[1]}: {done}; results in {found.out}"
         return
     rows = found.movies.head(ROWS_SHOWN).to_dict("records")
+    species = found.species[~found.species["outlier"].astype(bool)].groupby("movie")
     for row in rows:
         states = {"failed": row["why"], "missing": "not analysed yet"}
         texts = {"answer": row["answer"], "cautions": states.get(row["state"], row["cautions"])}
         row |= {name: text if isinstance(text, str) else "" for name, text in texts.items()}
+        if row["movie"] in species.groups and "kDa" in row["answer"]:  # else contrasts are
+            found_there = species.get_group(row["movie"]).to_dict("records")
+            row["answer"] = "\n".join(map(_species, found_there))
     shown = listing(
         rows,
-        "movie | sample | events | landings | answer | cautions",
+        "movie | sample | events | landings | species or median | cautions",
         "{movie} | {sample} | {events:.4g} | {landings:.4g} | {answer} | {cautions}",
         left=(0, 1, 4, 5),
     )
@@ -158,6 +162,13 @@ def _lines(found: Batch, part: tuple[int, int] | None = None) -> Iterator[Render
     if len(found.movies) > ROWS_SHOWN:
         yield f"… and {len(found.movies) - ROWS_SHOWN} more in {found.out / 'movies.csv'}"
     yield f"{done}; results in {found.out}, open {found.page}"
+
+
+def _species(row: Mapping[str, Any]) -> str:
+    """Print a species of a movie: its mass with its interval, events and share."""
+    mass, low, high = (short(row[f"mass{end}"], 3) for end in ("_kda", "_low", "_high"))
+    share = f", {100 * row['share']:.0f} %" if row["share"] == row["share"] else ""
+    return f"{mass} kDa ({low} to {high}): {row['count']:.0f}{share}"
 
 
 @command

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from iscat_cli.console import Messages, short, table
+from iscat_cli.console import Messages, listed, short, table
 from iscat_cli.options import (
     Count,
     ModeSetup,
@@ -30,7 +28,6 @@ if TYPE_CHECKING:
 
     from iscat_analysis.records import Analysis
 
-ROWS_SHOWN = 20
 GAP = 3  # characters between the columns of a table on a terminal
 
 
@@ -73,6 +70,19 @@ class FitSetup(ModeSetup, MovieSetup):
         return [*super().changes, *changes]
 
 
+@dataclass(frozen=True)
+class FitOutput(Output):
+    """Where the results of a fit go, and how much of them is printed.
+
+    Options
+    -------
+    --events N
+        Print the first N events as well, or tracks; fits.csv and tracks.csv have all of them.
+    """
+
+    events: Annotated[int, typer.Option(min=0)] = 0
+
+
 @command
 def fit(
     messages: Messages,
@@ -82,7 +92,7 @@ def fit(
     inject: Count = None,
     strict: str | None = None,
     setup: FitSetup,
-    output: Output,
+    output: FitOutput,
 ) -> None:
     """Fit the particles of a movie and set each spread beside its Cramér–Rao bounds.
 
@@ -147,7 +157,7 @@ def fit(
         how: Any = {"command": messages.command, "inject": inject or 0, "executor": executor}
         how["overwrite"] = output.overwrite
         analysis = fit_stack(stack, resolved, out=folder, **how, **told)
-    rows = _show(messages, analysis, folder)
+    rows = _show(messages, analysis, folder, output.events)
     if strict is not None and (
         any(map(_is_flagged, rows))
         or analysis.summary.get("repeats", {}).get("understated", False)
@@ -156,20 +166,16 @@ def fit(
         raise typer.Exit(3)  # something is flagged
 
 
-def _show(messages: Messages, analysis: Analysis, folder: Path) -> list[dict[str, Any]]:
+def _show(
+    messages: Messages, analysis: Analysis, folder: Path, events: int
+) -> list[dict[str, Any]]:
     """Print what was found, and give its rows, events and tracks."""
     rows: list[dict[str, Any]] = analysis.table.to_dict("records")
     found: dict[str, Any] = {**analysis.summary, "events": rows, "out": str(folder)}
-    if analysis.tracks is None:
-        messages.show("fit", found, _event_lines(analysis, folder))
-        messages.note(*_advice(rows))
-        return rows
-    from iscat_analysis.report.answer import advice
-
-    found["tracks"] = analysis.tracks.to_dict("records")
-    messages.show("fit", found, _track_lines(analysis, folder))
-    messages.note(*_advice(rows), *advice(analysis.tracks))
-    return [*rows, *found["tracks"]]
+    if analysis.tracks is not None:
+        found["tracks"] = analysis.tracks.to_dict("records")
+    messages.show("fit", found, _lines(analysis, folder, events))
+    return [*rows, *found.get("tracks", ())]
 
 
 def _codes(strict: str | None) -> frozenset[str]:
@@ -188,68 +194,53 @@ def _is_flagged(row: Mapping[str, Any]) -> bool:
     return row["status"] != "ok" or (isinstance(flags, str) and bool(flags))
 
 
-def _advice(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Say how many events have each status or flag, and what the user can do."""
-    from iscat_analysis.records import NO_EVENT, Status
-
-    flag_counts: Counter[str] = Counter()
-    for row in filter(_is_flagged, rows):
-        found = {str(row["status"]), *str(row["flags"] or "").split(";")}
-        flag_counts.update(found & NO_EVENT or found)
-    for status in Status:
-        if status != Status.OK and flag_counts[status.value]:
-            yield f"{flag_counts[status.value]} {status}: {status.advice}"
-
-
-def _event_lines(analysis: Analysis, folder: Path) -> Iterator[RenderableType]:
-    """Print the first events, and what all of them say together."""
-    from rich.console import Console
-
-    from iscat_analysis.config import MODES
-    from iscat_analysis.records import counted, tally
+def _lines(analysis: Analysis, folder: Path, events: int) -> Iterator[RenderableType]:
+    """Print the species, or what else is the answer, the first rows, and where all of it is."""
+    from iscat_analysis.records import tally
     from iscat_analysis.report import answer as said
 
-    found = tally(analysis.table)
-    if found.number:
-        if (flagged := said.caution(analysis.table)) is not None:
-            yield f"{flagged.text}."
-        shown, mass = counted(analysis.table).head(ROWS_SHOWN), ("mass", "kDa")
-        if said.is_uncalibrated(analysis):
-            yield from said.not_a_mass(analysis)
-            mass = ("mass, model scale", "kDa")
-            if said.main_quantity(analysis).column == "contrast":
-                shown, mass = said.as_contrasts(shown), ("contrast", "")
-        mode, console = MODES[analysis.mode], Console()
-        if mode.fits_sizes:
-            shown, mass = said.as_diameters(shown), ("diameter", "nm")
-        width = console.width if console.is_terminal else None
-        yield events_table(shown.to_dict("records"), mode.free, mass=mass, width=width)
-        if found.number > ROWS_SHOWN:
-            yield f"… and {found.number - ROWS_SHOWN} more in {folder / 'fits.csv'}"
-        yield from (answer.text for answer in said.answers(analysis, analysis.table))
-    yield f"{found.text()}; results in {folder}"
+    answer = said.spoken(analysis)
+    yield from answer.cautions
+    if answer.species.rows:
+        yield listed(answer.species)
+    yield from answer.facts
+    if events:
+        rows = analysis.table if analysis.tracks is None else analysis.tracks
+        name, number = "fits", tally(rows).number
+        if analysis.tracks is None:
+            yield _events_table(analysis, events)
+        else:
+            name = "tracks"
+            contrast = said.main_quantity(analysis) is said.CONTRAST
+            yield tracks_table(rows.head(events), contrast=contrast)
+        if number > events:
+            yield f"… and {number - events} more in {folder / name}.csv"
+    yield answer.totals
+    yield f"the page: {folder / 'report.html'}"
 
 
-def _track_lines(analysis: Analysis, folder: Path) -> Iterator[RenderableType]:
-    """Print the first tracks, and what all of them say together."""
-    from iscat_analysis.records import tally
-    from iscat_analysis.report.answer import headline, main_quantity, track_lines, tracks_of
-    from iscat_analysis.report.tables import event_table
+def _events_table(analysis: Analysis, number: int) -> Table:
+    """Tabulate the first events in the unit of their main quantity."""
+    from rich.console import Console
 
-    tracks = tracks_of(analysis)
-    if len(tracks):
-        contrast = main_quantity(analysis).column == "contrast"
-        yield tracks_table(tracks.head(ROWS_SHOWN), contrast=contrast)
-    if len(tracks) > ROWS_SHOWN:
-        yield f"… and {len(tracks) - ROWS_SHOWN} more in {folder / 'tracks.csv'}"
-    yield from headline(analysis, event_table(analysis))
-    yield from track_lines(analysis.summary)
-    yield f"{tally(tracks).text('track')}; results in {folder}"
+    from iscat_analysis.records import counted
+    from iscat_analysis.report import answer as said
+
+    shown, mass, console = counted(analysis.table).head(number), ("mass", "kDa"), Console()
+    if said.is_uncalibrated(analysis):
+        mass = ("mass, model scale", "kDa")
+        if said.main_quantity(analysis) is said.CONTRAST:
+            shown, mass = said.as_contrasts(shown), ("contrast", "")
+    if analysis.mode_kind.fits_sizes:
+        shown, mass = said.as_diameters(shown), ("diameter", "nm")
+    width = console.width if console.is_terminal else None
+    return events_table(shown.to_dict("records"), analysis.mode_kind.free, mass=mass, width=width)
 
 
 def tracks_table(tracks: pd.DataFrame, *, contrast: bool = False) -> Table:
     """Tabulate rows of ``tracks.csv``: mass or contrast, D, diameter and index if known."""
     from iscat_analysis.report.answer import TRACK_HEADINGS
+    from iscat_analysis.report.numbers import with_error
 
     rows = tracks.to_dict("records")
     columns = {"track": [str(row["track"]) for row in rows]}
@@ -258,12 +249,12 @@ def tracks_table(tracks: pd.DataFrame, *, contrast: bool = False) -> Table:
         if name == "mass" and contrast:
             relative = [row[error] / row[column] for row in rows]
             columns["contrast ± σ"] = [
-                _with_spread(row["contrast"], abs(share * row["contrast"]))
+                with_error(row["contrast"], abs(share * row["contrast"]))
                 for row, share in zip(rows, relative, strict=True)
             ]
         elif name in ("mass", "D") or (column in tracks and tracks[column].notna().any()):
             heading = f"{name} ± σ{f' [{unit}]' if unit else ''}"
-            columns[heading] = [_with_spread(row[column], row[error]) for row in rows]
+            columns[heading] = [with_error(row[column], row[error]) for row in rows]
     columns["status"] = [str(row["status"]) for row in rows]
     return _of_columns(columns)
 
@@ -281,13 +272,15 @@ def events_table(
     terminal of `width` characters parameters that are not free are left out, headings have two
     lines, and what fits least goes.
     """
+    from iscat_analysis.report.numbers import with_error
+
     symbols = {name: (name[0], "nm") for name in ("x_nm", "y_nm", "z_nm")} | {"mass_kda": mass}
     gap = " " if width is None else "\n"
     cells = {name: [str(row[name]) for row in rows] for name in ("event", "frame")}
     for name, (symbol, unit) in symbols.items():
         if name in free or width is None:
             heading = f"{symbol} ± σ{gap}{f'[{unit}]' if unit else ''}"
-            cells[heading] = [_with_spread(row[name], row[f"sigma_{name}"]) for row in rows]
+            cells[heading] = [with_error(row[name], row[f"sigma_{name}"]) for row in rows]
     shared = any(f"systematic_{name}" in row for row in rows for name in ("z_nm", "mass_kda"))
     errors = {"common": "systematic"} if shared else {}
     for name in (name for name in ("z_nm", "mass_kda") if name in free):
@@ -310,11 +303,3 @@ def _of_columns(cells: Mapping[str, Sequence[str]]) -> Table:
 
 def _widest(heading: str, cells: Sequence[str]) -> int:
     return max(map(len, [*heading.splitlines(), *cells]))
-
-
-def _with_spread(value: float, sigma: float | None) -> str:
-    """Write a value to the second significant digit of its standard deviation."""
-    if sigma is None or not math.isfinite(sigma) or sigma <= 0:
-        return short(value, 3)
-    digits = max(0, 1 - math.floor(math.log10(sigma)))
-    return f"{value:.{digits}f} ± {sigma:.{digits}f}"

@@ -45,11 +45,17 @@ from iscat_analysis.report.numbers import (
     LABELS,
     UNITS,
     Fact,
+    Table,
     decimals_for,
     fixed,
+    intervals,
     number,
+    numeric,
+    of,
     percent,
     sentence,
+    tabulate,
+    with_error,
 )
 from iscat_analysis.units import count
 
@@ -277,22 +283,85 @@ def _differ(table: pd.DataFrame) -> bool:
     return float(chdtrc(max(mass.size - 1, 1), float(np.nansum(off**2)))) < 1e-3
 
 
-def _species(main: Quantity, summary: Mapping[str, Any], table: pd.DataFrame) -> Fact | None:
-    """List the species, if there are several, on the scale of the main quantity."""
+def species_of(analysis: Analysis) -> pd.DataFrame:
+    """Tabulate the species of an analysis, the lightest first; empty where there is no fair answer.
+
+    Columns: the quantity that tells species apart, as ``mass_kda``, ``contrast`` where masses have
+    no scale, or ``diameter_nm`` of spheres; with ``sigma_`` and ``systematic_`` before that name
+    its standard error, and the error that all events of the movie share; `count`; `share` with
+    the ends of its 95 % interval, `share_low` and `share_high`; `landing` and `leaving`.
+    """
+    main, summary, table = main_quantity(analysis), analysis.summary, counted(analysis.table)
+    if analysis.tracks is None:
+        fair = caution(table) is None
+    else:
+        main, summary, table = DIAMETER, {"sizes": summary.get("sizes")}, analysis.tracks
+        fair = caution(table, TRACKS_KIND) is None
+    return _species_table(main, summary, table) if fair else _species_table(main, {}, table)
+
+
+def _species_table(main: Quantity, summary: Mapping[str, Any], table: pd.DataFrame) -> pd.DataFrame:
+    """Tabulate species, if any are described, on the scale of the main quantity."""
     populations = (summary.get("sizes") or {}).get("populations", ())
     described = (summary.get("distribution") or {}).get("species", ())
-    found, column = (populations, "diameter_nm") if populations else (described, "mass_kda")
+    found, stem, column = described, "mass", "mass_kda"
+    if populations:
+        main, found, stem, column = DIAMETER, populations, "diameter", "diameter_nm"
     known = [each for each in found if not (each["outlier"] or each.get("background"))]
-    values = np.array([each[column] for each in known], dtype=float)
-    if len(values) < 2:
-        return None
-    if main.power:
-        rows = _good(table)
-        per = (rows[main.column] / rows["mass_kda"] ** main.power).abs().to_numpy(float)
+    ends = ("se", "low", "high", "systematic")
+    names = [column, *(f"{stem}_{end}" for end in ends), "count", "fraction", "landing", "leaving"]
+    rows = pd.DataFrame(known, columns=[*names, "fraction_low", "fraction_high"], dtype=float)
+    values, sigma, low, high, shared = (rows[name] for name in names[:5])
+    sigma = sigma.fillna((high - low) / 3.92)
+    if main.power and len(rows):
+        good = _good(table)
+        per = (good[main.column] / good["mass_kda"] ** main.power).abs().to_numpy(float)
+        shared, relative = shared * math.nan, main.power * sigma / values
         values = quartiles(per)[1] * values**main.power
-    named = "Diameters" if populations else f"Species of {main.label}"
-    unit = "nm" if populations else main.unit
-    return Fact(named, " · ".join(map(number, values.tolist())), unit)
+        sigma = relative * values
+    if (common := _good(table).get(f"systematic_{main.column}")) is not None:
+        relative = (common / _good(table)[main.column]).abs().to_numpy(float)
+        shared = shared.fillna(quartiles(relative)[1] * values)
+    if "landing" not in summary:
+        rows[["landing", "leaving"]] = math.nan
+    errors = {f"sigma_{main.column}": sigma, f"systematic_{main.column}": shared}
+    shares = {f"share{end}": rows[f"fraction{end}"] for end in ("", "_low", "_high")}
+    return pd.DataFrame(
+        {main.column: values, **errors, "count": rows["count"], **shares}
+        | {name: rows[name] for name in ("landing", "leaving")}
+    ).sort_values(main.column, ignore_index=True)
+
+
+def species_listing(analysis: Analysis) -> Table:
+    """Write the species as people read them; columns of which nothing is known are left out."""
+    found = species_of(analysis)
+    column = str(found.columns[0])
+    named = DIAMETER if column == DIAMETER.column else main_quantity(analysis)
+    unit = f" [{named.unit}]" if named.unit else ""
+    columns = [
+        numeric(
+            f"{named.label} ± σ{unit}", lambda row: with_error(row[column], row[f"sigma_{column}"])
+        ),
+        numeric(f"± common{unit}", of(f"systematic_{column}", number, 2)),
+        numeric(f"{row_kind(analysis).noun}s", of("count", fixed, 0)),
+        *intervals("share", "share", in_percent=True),
+        numeric("landing", of("landing", fixed, 0)),
+        numeric("leaving", of("leaving", fixed, 0)),
+    ]
+    records = found.to_dict("records")
+    shown = [c for c in columns if any(c.cell(record) != "—" for record in records)]
+    return tabulate(records, shown)
+
+
+def _species(main: Quantity, summary: Mapping[str, Any], table: pd.DataFrame) -> Fact | None:
+    """List the species, if there are several, on the scale of the main quantity."""
+    found = _species_table(main, summary, table)
+    if len(found) < 2:
+        return None
+    sizes = found.columns[0] == DIAMETER.column
+    named = "Diameters" if sizes else f"Species of {main.label}"
+    values = found[found.columns[0]].tolist()
+    return Fact(named, " · ".join(map(number, values)), DIAMETER.unit if sizes else main.unit)
 
 
 def _of_tracks(
@@ -557,9 +626,50 @@ def track_lines(summary: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def advice(tracks: pd.DataFrame) -> Iterator[str]:
-    """Explain the flags of tracks."""
-    flag_counts = Counter(flag for flags in tracks["flags"] for flag in str(flags).split(";"))
-    for status in TrackStatus:
-        if flag_counts[status.value]:
-            yield f"{count(flag_counts[status.value], 'track')} {status}: {status.advice}"
+@dataclass(frozen=True)
+class Spoken:
+    """An analysis in a few lines, as a terminal and a notebook show it.
+
+    Attributes
+    ----------
+    cautions : list of str
+        Why there is no answer, or no mass.
+    species : Table
+        The species; no rows where there are none.
+    facts : list of str
+        The answer where there are no species.
+    totals : str
+        Events, or tracks, by status, and what can be done about the commonest flag.
+    """
+
+    cautions: list[str]
+    species: Table
+    facts: list[str]
+    totals: str
+
+
+def spoken(analysis: Analysis) -> Spoken:
+    """Say in a few lines what was found, and what to do first."""
+    kind, table = row_kind(analysis), analysis.table
+    judged = table if analysis.tracks is None else analysis.tracks
+    rows, flagged = tally(judged), caution(judged, kind)
+    totals = f"{rows.text(kind.noun)}."
+    if not rows.number:
+        nothing = NOTHING_FOUND().remedy if kind is EVENTS_KIND or table.empty else ""
+        return Spoken([], Table((), ()), [], f"{totals} {sentence(nothing)}" if nothing else totals)
+    cautions = [sentence(flagged.text)] if flagged is not None else []
+    remarks = Counter(
+        name for row in counted(judged).itertuples() for name in {row.status, *_flags(row.flags)}
+    )
+    known = [(n, status) for status in kind.status if (n := remarks[status.value])]
+    known = [each for each in known if each[1] != Status.OK]
+    if known and flagged is None:
+        number, first = max(known, key=lambda each: each[0])
+        totals += f" {number} {first}: {sentence(first.advice)}"
+    species = species_listing(analysis)
+    facts = [] if species.rows else [fact.text for fact in answers(analysis, table)]
+    return Spoken([*cautions, *not_a_mass(analysis)], species, facts, totals)
+
+
+def _flags(flags: Any) -> list[str]:
+    return flags.split(";") if isinstance(flags, str) else []

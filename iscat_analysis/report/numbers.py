@@ -154,6 +154,14 @@ def with_interval(
     return f"{fixed(value, decimals)}{unit}", ends
 
 
+def with_error(value: float, sigma: float | None) -> str:
+    """Write a value to the second significant digit of its standard deviation."""
+    if sigma is None or not math.isfinite(sigma) or sigma <= 0:
+        return number(value)
+    decimals = decimals_for([sigma])
+    return f"{fixed(value, decimals)} ± {fixed(sigma, decimals)}"
+
+
 def bracketed(value: float | None, ends: Sequence[float | None]) -> str:
     """Write a number and its interval in one cell."""
     if value is None or not math.isfinite(value):

@@ -52,9 +52,8 @@ def _analysis(
     table = pd.DataFrame(list(rows), columns=list(EVENT_COLUMNS))
     more = {"count": np.int64(len(rows)), "mass_scale": mass_scale, **(summary or {})}
     summary = summary_of(table, mode, "iscat") | more
-    return SimpleNamespace(
-        table=table, mode=mode, scheme="iscat", summary=summary, tracks=None, findings=findings
-    )
+    about = {"table": table, "mode": mode, "mode_kind": MODES[mode], "tracks": None}
+    return SimpleNamespace(scheme="iscat", summary=summary, findings=findings, **about)
 
 
 @pytest.fixture
@@ -141,71 +140,97 @@ def printed(library, capsys) -> Callable[..., Any]:
     return run
 
 
-def test_the_table_is_short_and_plain(printed) -> None:
-    captured = printed(_row(0), _row(1, "at_bound", "at_bound"))
-    warned, heading, first, second, last = captured.out.splitlines()
+PAGE = "the page: movie.iscat/report.html"
+
+
+def test_the_answer_is_first_and_rows_come_only_where_they_are_asked_for(printed) -> None:
+    """Control: the same events, with and without `--events`."""
+    rows = [_row(n) for n in range(300)]
+    brief = printed(*rows).out.splitlines()
+    assert brief == ["Median mass 480 kDa, middle half 480 to 480 kDa", "300 events: 300 ok.", PAGE]
+    long = printed(*rows, options=("--events", "20")).out.splitlines()
+    assert [long[0], *long[-2:]] == brief
+    assert len(long) == 3 + 1 + 20 + 1
+    assert long[-3] == "… and 280 more in movie.iscat/fits.csv"
+
+
+def test_the_table_of_events_is_plain(printed) -> None:
+    rows = _row(0), _row(1, "at_bound", "at_bound")
+    captured = printed(*rows, options=("--events=9",))
+    warned, heading, first, second, *last = captured.out.splitlines()
     assert warned.startswith("1 of 2 events are flagged, so no median is given")
+    assert Status.AT_BOUND.advice.rstrip(".") in warned
     assert "\x1b" not in captured.out
     assert all(word in heading for word in ("event", "x ± σ", "CRB mass", "QCRB mass", "status"))
     for cell in ("3456.8 ± 1.2", "480 ± 12", "11.5", "5.1", "ok"):
         assert cell in first
     assert "at_bound" in second
-    assert last == "2 events: 1 ok, 1 at_bound; results in movie.iscat"
-    assert f"1 at_bound: {Status.AT_BOUND.advice}" in captured.err
+    assert last == ["2 events: 1 ok, 1 at_bound.", PAGE]
 
 
-def test_every_remark_is_explained(printed) -> None:
-    """A status hides no other: what is said beside it is counted and explained too."""
-    told = printed(_row(0, "poor_fit", "poor_fit;saturated"), _row(1, "saturated", "saturated")).err
-    assert f"1 poor_fit: {Status.POOR_FIT.advice}" in told
-    assert f"2 saturated: {Status.SATURATED.advice}" in told
+def test_the_commonest_remark_has_its_remedy(printed) -> None:
+    """A status hides no other: what is said beside it is counted too."""
+    rows = [*(_row(n) for n in range(10)), _row(10, "poor_fit", "poor_fit;saturated")]
+    totals = printed(*rows, _row(11, "saturated", "saturated")).out.splitlines()[-2]
+    assert totals.startswith("12 events: 10 ok, 1 poor_fit, 1 saturated. 2 saturated: ")
+    assert totals.endswith(Status.SATURATED.advice)
 
 
 def test_what_is_remarked_on_side_lobes_is_not_counted_among_the_events(printed) -> None:
     lobe = _row(1, "sidelobe", "sidelobe;poor_fit")
-    captured = printed(_row(0, "poor_fit", "poor_fit"), lobe)
-    told = captured.out.splitlines()
+    told = printed(_row(0, "poor_fit", "poor_fit"), lobe, options=("--events=9",)).out.splitlines()
     assert told[0].startswith("The only event is flagged")
-    assert len(told) == 4  # with a heading and one row
-    assert told[-1].startswith("1 event: 1 poor_fit; further rows, which are no events: 1 sidelobe")
-    assert f"1 poor_fit: {Status.POOR_FIT.advice}" in captured.err
-    assert f"1 sidelobe: {Status.SIDELOBE.advice}" in captured.err
+    assert len(told) == 5  # with a heading and one row
+    assert told[-2] == "1 event: 1 poor_fit; further rows, which are no events: 1 sidelobe."
 
 
 def test_without_calibration_contrasts_are_printed(printed) -> None:
     """A contrast of −0.0149 for 480.4 kDa: the spread keeps its share, and no kDa is printed."""
     row = _row(0) | {"contrast": -0.0149}
-    warned, heading, first, answer, last = printed(
-        row, mass_scale="absolute model"
+    warned, answer, heading, first, *last = printed(
+        row, mass_scale="absolute model", options=("--events=9",)
     ).out.splitlines()
     assert "iscat calibrate mass" in warned
     assert "contrast ± σ" in heading
     assert "kDa" not in heading
-    assert "-0.01490 ± 0.00037" in first
+    assert "−0.01490 ± 0.00037" in first
     assert answer == "Contrast 0.0149"
-    assert last == "1 event: 1 ok; results in movie.iscat"
+    assert last == ["1 event: 1 ok.", PAGE]
 
 
 def test_joint_shows_the_bounds_of_height_too(printed) -> None:
-    assert "CRB z [nm]  QCRB z [nm]  CRB mass [kDa]" in printed(_row(0), mode="joint").out
+    out = printed(_row(0), mode="joint", options=("--events=9",)).out
+    assert "CRB z [nm]  QCRB z [nm]  CRB mass [kDa]" in out
 
 
-def test_a_long_table_is_cut(printed) -> None:
-    out = printed(*(_row(n) for n in range(300))).out.splitlines()
-    assert len(out) == 24
-    assert out[-3] == "… and 280 more in movie.iscat/fits.csv"
-    assert out[-2] == "Median mass 480 kDa, middle half 480 to 480 kDa"
-
-
-def test_several_species_are_printed_in_place_of_a_median(printed) -> None:
-    species = [{"mass_kda": m, "outlier": m == 9.0} for m in (9.0, 66.0, 146.0)]
-    told = printed(_row(0), _row(1), summary={"distribution": {"species": species}}).out
-    assert told.splitlines()[-2] == "Species of mass 66.0 · 146 kDa"
-    assert "edian" not in told
+def test_species_are_a_table_in_place_of_a_median(printed) -> None:
+    """Outliers are no species; on the scale of contrasts nothing is in kDa."""
+    species = [
+        {"mass_kda": m, "mass_se": 1.31, "mass_systematic": 1.4, "count": 9.0, "fraction": 0.4}
+        | {"fraction_low": 0.25, "fraction_high": 0.55, "landing": 8, "leaving": 1}
+        | {"outlier": m == 9.0}
+        for m in (146.0, 9.0, 66.0)
+    ]
+    summary = {"distribution": {"species": species}, "landing": {}}
+    heading, *rows, totals, page = printed(_row(0), _row(1), summary=summary).out.splitlines()
+    names = "mass ± σ [kDa]", "± common [kDa]", "events", "share", "95 %", "landing", "leaving"
+    assert all(name in heading for name in names)
+    cells = [line.split("  ") for line in rows]
+    cells = [[cell.strip() for cell in line if cell.strip()] for line in cells]
+    assert cells == [
+        ["66.0 ± 1.3", "1.4", "9", "40 %", "25 to 55 %", "8", "1"],
+        ["146.0 ± 1.3", "1.4", "9", "40 %", "25 to 55 %", "8", "1"],
+    ]
+    assert (totals, page) == ("2 events: 2 ok.", PAGE)
+    out = printed(_row(0), summary={**summary, "mass_scale": "absolute model"}).out
+    assert "contrast ± σ" in out
+    assert "[kDa]" not in out
 
 
 def test_no_events_is_a_result(printed) -> None:
-    assert printed(options=("--strict",)).out == "0 events; results in movie.iscat\n"
+    nothing, page = printed(options=("--strict",)).out.splitlines()
+    assert nothing.startswith("0 events. If particles can be seen by eye, look at the field image")
+    assert page == PAGE
 
 
 def test_json_is_one_object_without_nan(printed) -> None:
@@ -524,7 +549,7 @@ def test_bars_are_drawn_on_a_terminal_only(quiet: bool) -> None:
         out = process.stdout.read()
     os.close(master)
     assert process.returncode == 0
-    assert out == b"0 events; results in movie.iscat\n"
+    assert out.startswith(b"0 events. If particles can be seen by eye")
     assert (b"fitting" in drawn and b"half way" in drawn) is not quiet
     assert (b"\x1b[" in drawn) is not quiet
 

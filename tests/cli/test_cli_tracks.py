@@ -108,8 +108,9 @@ def test_without_a_frame_rate_there_are_tracks_and_one_line(
     tracks = pd.read_csv(tmp_path / "out" / "tracks.csv")
     assert tracks["d_um2_s"].isna().all()
     assert tracks["mass_kda"].notna().all()
-    assert "begin or end at the border of the field" in printed.out
-    assert "mass ± σ [kDa]" in printed.out
+    assert "mass ± σ [kDa]" not in printed.out
+    assert _fit(folder, tmp_path / "rows", "--events", "2") == 0
+    assert "mass ± σ [kDa]" in capsys.readouterr().out
 
 
 def test_an_exposure_longer_than_the_interval_ends_with_2(
