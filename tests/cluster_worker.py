@@ -1,15 +1,21 @@
-"""Preloaded by the workers that tests start: their reports are written without figures."""
+"""The scheduler and the workers that tests start, whose reports are written without figures."""
 
 from __future__ import annotations
 
 import os
 import time
+from importlib import import_module
 from typing import Any
 
 import pytest
 from sketches import sketch_figures
 
 from iscat_analysis.threads import threads
+
+
+def serve(kind: str, options: list[str]) -> None:
+    """Be a ``scheduler`` or a ``worker``."""
+    import_module(f"distributed.cli.dask_{kind}").main(options)
 
 
 def dask_setup(worker: Any) -> None:

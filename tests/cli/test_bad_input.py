@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import re
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
+from deaf import deaf
+from forks import fork, send
 from numpy.typing import NDArray
 
 from iscat_cli import main, main_fit
@@ -337,55 +338,20 @@ def test_progress_does_not_hide_the_one_error(movie: Path, tmp_path: Path, capsy
 
 
 def _interrupted(
-    command: list[str], folder: Path, begun: Callable[[subprocess.Popen[str]], None]
-) -> tuple[int, str]:
-    """Interrupt a command once it has begun; give its status, and what it said from then on."""
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=folder)
-    try:
-        begun(process)
-        process.send_signal(signal.SIGINT)
-        said = process.communicate(timeout=120)[1]
-    finally:
-        process.kill()
-    return process.returncode, said
-
-
-def _wait_until_said(sign: str, process: subprocess.Popen[str]) -> None:
-    for line in process.stderr:
-        if sign in line:
-            break
-
-
-_DEAF = """
-import itertools, sys, time
-import iscat_cli
-
-def deaf():
-    while True:
+    command: Callable[[list[str]], int], arguments: list[str], begun: Callable[[str], bool]
+) -> tuple[int | None, str]:
+    """Interrupt a command once it has begun; give its status, and what it said."""
+    with TemporaryDirectory() as folder:
+        log = Path(folder) / "err"
+        process = fork(command, arguments, folder=Path(folder), err=log)
         try:
-            print("deaf", file=sys.stderr, flush=True)
-            time.sleep(60)
-        except KeyboardInterrupt:
-            pass
-
-def counted(frames, *_):
-    yield from itertools.islice(frames, 2)
-    deaf()
-
-def fill_report(analysis, folder, **_):
-    (folder / "fits.csv").write_text("half of it")
-    deaf()
-
-if sys.argv[1] == "simulate":
-    from iscat_analysis.study import simulate
-    simulate._counted = counted
-else:
-    from iscat_analysis import report
-    from iscat_cli import ending
-    report.fill_report = fill_report
-    ending.WRITING_GRACE_S = 0.5
-sys.exit(iscat_cli.main())
-"""
+            while process.is_alive() and not (log.exists() and begun(log.read_text())):
+                time.sleep(0.02)
+            send(process, signal.SIGINT)
+            process.join(120)
+        finally:
+            process.kill()
+        return process.exitcode, log.read_text()
 
 
 @pytest.mark.parametrize("command", ["simulate", "fit"])
@@ -404,12 +370,13 @@ def test_ctrl_c_that_goes_unanswered(command: str, tmp_path: Path) -> None:
     left = _listing(tmp_path)
     fit = ["fit", str(movie), "--config", str(setup)]
 
-    def begun(process: subprocess.Popen[str]) -> None:
-        _wait_until_said("deaf", process)
+    def begun(said: str) -> bool:
+        if "deaf" not in said:
+            return False
         assert len(_listing(tmp_path)) > len(left)
+        return True
 
-    deaf = [sys.executable, "-c", _DEAF, *(simulate if command == "simulate" else fit)]
-    status, said = _interrupted(deaf, tmp_path, begun)
+    status, said = _interrupted(deaf, simulate if command == "simulate" else fit, begun)
     assert status == -signal.SIGINT  # which a shell gives as 130
     assert "interrupted: SIGINT was received" in said
     assert _listing(tmp_path) == left
@@ -427,23 +394,17 @@ def test_ctrl_c_midway(stage: str, tmp_path: Path) -> None:
     )
     movie = tmp_path / "movie.tif"
     simulate = ["simulate", "--config", str(setup), "--out", str(movie)]
-    command = [sys.executable, "-c", "import sys, iscat_cli; sys.exit(iscat_cli.main())"]
     if stage == "posterior":
         assert main([*simulate, "--quiet"]) == 0
-        command += ["fit", str(movie), "--config", str(setup)]
-    else:
-        command += simulate
     left = _listing(tmp_path)
 
-    def begun(process: subprocess.Popen[str]) -> None:
+    def begun(said: str) -> bool:
         if stage == "posterior":
-            _wait_until_said("detect: 8 of 8", process)
-        while stage == "simulate" and process.poll() is None:
-            if list(tmp_path.glob("movie.tif.*.partial")):
-                break
-            time.sleep(0.05)
+            return "detect: 8 of 8" in said
+        return bool(list(tmp_path.glob("movie.tif.*.partial")))
 
-    status, said = _interrupted(command, tmp_path, begun)
+    fit = ["fit", str(movie), "--config", str(setup)]
+    status, said = _interrupted(main, simulate if stage == "simulate" else fit, begun)
     assert status == INTERRUPTED
     assert len([line for line in said.splitlines() if "error: interrupted" in line]) == 1
     assert "Traceback" not in said

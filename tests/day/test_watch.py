@@ -6,9 +6,8 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from forks import fork, send
 from small_movies import SETUP, analysed, put_in_place_of_fits
 from tiff_files import write_ome_set
 
@@ -303,22 +303,20 @@ def test_without_movies_too_one_object_is_printed(folder: Path, monkeypatch, cap
     assert printed["movies"] == []
 
 
-def test_ctrl_c_ends_the_waiting_without_an_error(folder: Path) -> None:
-    code = "import sys; from iscat_cli import main; sys.exit(main())"
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, "watch", str(folder), "--interval", "3600"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+def test_ctrl_c_ends_the_waiting_without_an_error(folder: Path, tmp_path: Path) -> None:
+    out, err = tmp_path / "out", tmp_path / "err"
+    command = ["watch", str(folder), "--interval", "3600"]
+    process = fork(main, command, folder=tmp_path, out=out, err=err)
     try:
-        assert process.stderr is not None
-        assert "Ctrl-C ends it" in process.stderr.readline()
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=60)
+        while process.is_alive() and not (err.exists() and "Ctrl-C ends it" in err.read_text()):
+            time.sleep(0.02)
+        send(process, signal.SIGINT)
+        process.join(60)
     finally:
         process.kill()
-    assert process.returncode == 0
-    assert out == f"no movie came into {folder}\n"
-    assert "error" not in err
+    assert process.exitcode == 0
+    assert out.read_text() == f"no movie came into {folder}\n"
+    assert "error" not in err.read_text()
 
 
 # ---- what is wrong ---------------------------------------------------------------------------

@@ -1,6 +1,4 @@
-"""One run of `iscat` in a process of its own, as an order in JSON says.
-
-    python runner.py ORDER
+"""One run of `iscat` in a process of its own, as an order says.
 
 The order is ``{"run": [argument, …]}``, with
 
@@ -10,33 +8,28 @@ The order is ``{"run": [argument, …]}``, with
 - ``"figures": true`` to draw the figures, which take nine tenths of a small run; otherwise files of
   a kilobyte take their places.
 
-It writes a line to the descriptor ``"ready"`` when everything is imported, and the run begins.
+It sends word when the run begins.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import pathlib
 import signal
-import sys
 from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
 
 import pytest
 from sketches import sketch_figures
 
-from iscat_analysis import pipeline  # what a run imports, before the clock runs
-from iscat_analysis.report import movie_page
+from iscat_analysis.report.output import claim_output
 from iscat_analysis.search import chunks
 from iscat_cli import main
 
-LOADED = (pipeline, movie_page)
 
-
-def _run(order: dict[str, Any]) -> int:
+def obey(order: dict[str, Any], ready: Connection) -> int:
+    """Do what is ordered, and give the status."""
     if not order.get("figures"):
         # a moment to be killed in, at each figure
         sketch_figures(pytest.MonkeyPatch(), pause_s=0.01)
@@ -44,7 +37,7 @@ def _run(order: dict[str, Any]) -> int:
         chunks.MEMORY_SHARE = order["memory_share"]
     if "die" in order:
         _die_while_renaming(*order["die"])
-    os.write(order["ready"], b"\n")
+    ready.send(None)
     return main(order["run"])
 
 
@@ -52,7 +45,7 @@ def _die_while_renaming(word: str, number: int) -> None:
     count = 0
 
     def deadly(rename: Callable[..., Any]) -> Callable[..., Any]:
-        def renamed(self: pathlib.Path, target: Any) -> Any:
+        def renamed(self: Path, target: Any) -> Any:
             nonlocal count
             count += 1
             if count == number and word == "before":
@@ -65,8 +58,11 @@ def _die_while_renaming(word: str, number: int) -> None:
         return renamed
 
     for name in ("rename", "replace"):
-        setattr(pathlib.Path, name, deadly(getattr(pathlib.Path, name)))
+        setattr(Path, name, deadly(getattr(Path, name)))
 
 
-if __name__ == "__main__":
-    sys.exit(_run(json.loads(sys.argv[1])))
+def hold(held: Connection) -> None:
+    """Claim a result twice, which the same process may: it is the same run."""
+    with claim_output(Path("result")), claim_output(Path("result")):
+        held.send(None)
+        held.recv()

@@ -6,20 +6,20 @@ import json
 import os
 import re
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import combinations
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cluster_worker import busy
+from cluster_worker import busy, serve
 from distributed import Client, Future
+from forks import fork
 from small_movies import SETUP
 
 import iscat_analysis as ia
@@ -67,24 +67,18 @@ def small_chunks() -> Iterator[None]:
 class Workers:
     """A scheduler and workers, each a process of its own."""
 
-    def __init__(self, folder: Path, root: Path) -> None:
+    def __init__(self, folder: Path) -> None:
         self._folder = folder
         self.file = folder / "scheduler.json"
-        paths = [str(root), str(root / "tests"), str(root / ".typing")]
-        self._environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-        self._running: list[subprocess.Popen[bytes]] = []
+        self._running: list[BaseProcess] = []
         self._start("scheduler", "--port", "0", "--host", "127.0.0.1")
         wait_until(self.file.is_file)
         self.client = Client(json.loads(self.file.read_text())["address"], set_as_default=False)
 
     def _start(self, kind: str, *options: str) -> None:
-        command = [sys.executable, "-m", "dask", kind, "--scheduler-file", str(self.file)]
-        command += ["--no-dashboard", *options]
-        with (self._folder / f"{len(self._running)}.log").open("wb") as log:
-            process = subprocess.Popen(
-                command, cwd=self._folder, env=self._environment, stdout=log, stderr=log
-            )
-        self._running.append(process)
+        given = ["--scheduler-file", str(self.file), "--no-dashboard", *options]
+        log = self._folder / f"{len(self._running)}.log"
+        self._running.append(fork(serve, kind, given, folder=self._folder, out=log, err=log))
 
     def add(self, count: int) -> None:
         """Have so many workers or more."""
@@ -116,7 +110,7 @@ class Workers:
         self.client.close()
         for process in reversed(self._running):
             process.kill()
-            process.wait()
+            process.join()
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
@@ -128,11 +122,11 @@ def wait_until(condition: Callable[[], bool]) -> None:
 
 
 @pytest.fixture(scope="module")
-def cluster(tmp_path_factory, repo_root: Path) -> Iterator[Workers]:
+def cluster(tmp_path_factory) -> Iterator[Workers]:
     """Start a scheduler; tests add the workers that they need."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(places, "CONNECT_S", DEADLINE_S)  # other tests keep the machine busy
-        workers = Workers(tmp_path_factory.mktemp("cluster"), repo_root)
+        workers = Workers(tmp_path_factory.mktemp("cluster"))
         try:
             yield workers
         finally:

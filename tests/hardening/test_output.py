@@ -11,12 +11,11 @@ import resource
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,8 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet
 import pytest
+from forks import fork, send
+from hardening.runner import hold, obey
 from report_factory import make_analysis
 from sketches import sketch_figures
 from small_movies import LANDING
@@ -66,17 +67,6 @@ frames = 40
 events = [{frame = 20, x_px = 23.2, y_px = 24.4, mass_kda = 3000.0}]
 """
 FIT = ["fit", "movie.tif", "--config", "setup.toml", "--out", "result", "--overwrite"]
-
-
-HOLD = """
-import pathlib, sys
-from iscat_analysis.report.output import claim_output
-result = pathlib.Path("result")
-with claim_output(result):
-    with claim_output(result):  # the same process may: it is the same run
-        print(flush=True)
-        sys.stdin.read()
-"""
 
 
 @contextlib.contextmanager
@@ -128,29 +118,21 @@ class Runner:
             return list(pool.map(self._one, orders))
 
     def _one(self, order: dict[str, Any]) -> dict[str, Any]:
-        script = Path(__file__).with_name("runner.py")
-        begun, ready = os.pipe()
-        told = json.dumps({**order, "ready": ready})
-        with tempfile.TemporaryFile() as err:
-            process = subprocess.Popen(
-                [sys.executable, str(script), told], cwd=order["cwd"], pass_fds=[ready],
-                stdout=subprocess.DEVNULL, stderr=err,
-                env={**os.environ, "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"},
-            )  # fmt: skip
-            os.close(ready)
-            os.read(begun, 1)
-            os.close(begun)
+        begun, ready = Pipe(duplex=False)
+        with tempfile.NamedTemporaryFile() as err:
+            log = Path(err.name)
+            process = fork(obey, order, ready, folder=order["cwd"], err=log)
+            ready.close()
+            begun.recv()
             begin = time.monotonic()
             if "kill" in order:
                 number, share = order["kill"]
-                with suppress(subprocess.TimeoutExpired):
-                    process.wait(share * order.get("duration", min(self.seconds)))
-                process.send_signal(number)
-            status = process.wait()
+                process.join(share * order.get("duration", min(self.seconds)))
+                send(process, number)
+            process.join()
             seconds = time.monotonic() - begin
-            err.seek(0)
-            said = err.read().decode("utf-8", "backslashreplace")
-        return {"status": status, "err": said, "seconds": seconds}
+            said = log.read_text(encoding="utf-8", errors="backslashreplace")
+        return {"status": process.exitcode, "err": said, "seconds": seconds}
 
 
 @pytest.fixture(scope="module")
@@ -397,14 +379,13 @@ def test_two_runs_into_one_folder(runner: Runner, place: Path, options: list[str
 
 
 def test_a_run_that_is_under_way_is_respected(runner: Runner, place: Path) -> None:
-    with subprocess.Popen(
-        [sys.executable, "-c", HOLD], cwd=place, stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as holder:
-        assert holder.stdout is not None
-        assert holder.stdout.readline() == b"\n"
-        answer = runner.here({"run": FIT, "cwd": str(place)})
-        holder.communicate()
-    assert holder.returncode == 0
+    told, held = Pipe()
+    holder = fork(hold, held, folder=place, err=Path(os.devnull))
+    told.recv()
+    answer = runner.here({"run": FIT, "cwd": str(place)})
+    told.send(None)
+    holder.join()
+    assert holder.exitcode == 0
     assert answer["status"] == 1
     expected = f"result: another run (process {holder.pid}) is about to write there"
     assert expected in one_line(answer)
