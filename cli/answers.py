@@ -86,8 +86,7 @@ def species(
     if rates is not None:
         values["kinetics"] = rates.to_dict()
     lines = [*_lines(found), *_rate_lines(rates)]
-    folder, page = output.out, "figures/species.png"
-    messages.answer("species", values, lines, folder=folder, page=page, notes=notes)
+    messages.answer("species", values, lines, output.out, "figures/species.png", notes=notes)
 
 
 def _refuse_single(options: SpeciesOptions, *, rates: bool) -> None:
@@ -116,8 +115,8 @@ def _compare(messages: Messages, events: list[Path], output: Output, options: An
     values = comparison_document(names[0], names[1:], found, notes)
     pairs = zip(names[1:], found, strict=True)
     lines = [line for name, one in pairs for line in _comparison_lines(name, names[0], one)]
-    folder, page = output.out, "figures/comparison.png"
-    messages.answer("species_comparison", values, lines, folder=folder, page=page, notes=notes)
+    page = "figures/comparison.png"
+    messages.answer("species_comparison", values, lines, output.out, page, notes=notes)
 
 
 def _comparison_lines(name: str, first: str, found: Comparison) -> Iterator[RenderableType]:
@@ -242,10 +241,8 @@ def kd(
 
     found = fit_kd(samples, model=model, **options, out=output.out, overwrite=output.overwrite)
     values = {"source": str(samples), **found.to_dict()}
-    folder, page = output.out, "figures/kd.png"
-    messages.answer(
-        "kd", values, _binding_lines(found), folder=folder, page=page, notes=found.notes
-    )
+    lines, page = _binding_lines(found), "figures/kd.png"
+    messages.answer("kd", values, lines, output.out, page, notes=found.notes)
 
 
 def _binding_lines(found: Binding) -> Iterator[RenderableType]:

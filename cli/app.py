@@ -16,25 +16,16 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from iscat_cli import INTERRUPTED
-from iscat_cli.answers import kd, species
-from iscat_cli.bounds import bounds
-from iscat_cli.calibrate import SUMMARY as CALIBRATE_SUMMARY
-from iscat_cli.calibrate import camera, mass, optics
+from iscat_cli import INTERRUPTED, answers, bounds, calibrate, day, fit, results, setup, study
 from iscat_cli.console import UNEXPECTED, Messages, silence
-from iscat_cli.day import batch, watch
-from iscat_cli.fit import fit
 from iscat_cli.options import Command
-from iscat_cli.results import app, export, view
-from iscat_cli.setup import config, init
-from iscat_cli.study import SUMMARY as CHALLENGE_SUMMARY
-from iscat_cli.study import benchmark, make, score, simulate
 
-_MOVIES, _ANSWERS = (init, fit, batch, watch, simulate), (bounds, benchmark, species, kd)
-COMMANDS = (*_MOVIES, *_ANSWERS, export, view, app, config)
+_MOVIES = (setup.init, fit.fit, day.batch, day.watch, study.simulate)
+_ANSWERS = (bounds.bounds, study.benchmark, answers.species, answers.kd)
+COMMANDS = (*_MOVIES, *_ANSWERS, results.export, results.view, results.app, setup.config)
 GROUPS = (
-    ("calibrate", CALIBRATE_SUMMARY, (camera, optics, mass)),
-    ("challenge", CHALLENGE_SUMMARY, (make, score)),
+    ("calibrate", calibrate.SUMMARY, (calibrate.camera, calibrate.optics, calibrate.mass)),
+    ("challenge", study.SUMMARY, (study.make, study.score)),
 )
 """Commands with commands of their own: their name, what they are for, and these."""
 
@@ -56,7 +47,7 @@ def _command_of(program: str) -> Any:
     """Make the command of a program, once for all runs of a process."""
     if program == "iscat":
         return typer.main.get_command(_umbrella())
-    alone = replace(fit, example=fit.example.replace("iscat fit", "iscat-fit"))
+    alone = replace(fit.fit, example=fit.fit.example.replace("iscat fit", "iscat-fit"))
     return typer.main.get_command(_of([alone]))
 
 

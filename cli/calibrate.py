@@ -62,8 +62,7 @@ def camera(
     known: Any = {"dark": dark, "offset_adu": offset, "maps": maps, "overwrite": output.overwrite}
     with messages.telling() as told:
         found = camera_calibration(stacks or (), folder, **known, **told)
-    values, page = found.to_dict(), "camera.html"
-    messages.answer("camera", values, _camera_lines(found), folder=folder, page=page)
+    messages.answer("camera", found.to_dict(), _camera_lines(found), folder, "camera.html")
 
 
 def _camera_lines(found: CameraCalibration) -> Iterator[RenderableType]:
@@ -139,8 +138,8 @@ def mass(
         overwrite=output.overwrite,
         notify=messages.note,
     )
-    values, page = found.to_dict(), "calibration.html"
-    messages.answer("calibration", values, _mass_lines(found), folder=folder, page=page)
+    lines = _mass_lines(found)
+    messages.answer("calibration", found.to_dict(), lines, folder, "calibration.html")
 
 
 def _standards(text: str) -> tuple[list[float], list[float]]:
@@ -221,7 +220,7 @@ def optics(
     with messages.telling() as told:
         found = optics_calibration(movie, setup.load(), folder, **known, **told)
     values = {key: value for key, value in found.to_dict().items() if key != "pictures"}
-    messages.answer("optics", values, _optics_lines(found), folder=folder, page="optics.html")
+    messages.answer("optics", values, _optics_lines(found), folder, "optics.html")
     if not found.accepted:
         raise DataError(
             f"{movie}: the optics are refused: {'; '.join(found.measured.refusals)}; record "
@@ -249,8 +248,7 @@ def _measure(messages: Messages, movie: Path, setup: Setup, output: Output) -> N
         found = template_calibration(
             movie, setup.load(), folder, overwrite=output.overwrite, **told
         )
-    values, lines, page = found.to_dict(), [found.headline()], "template.html"
-    messages.answer("template", values, lines, folder=folder, page=page)
+    messages.answer("template", found.to_dict(), [found.headline()], folder, "template.html")
     if not found.accepted:
         raise DataError(
             f"{movie}: the template is refused: {'; '.join(found.refusals)}; record more particles "

@@ -107,9 +107,9 @@ class Messages:
         document: str,
         values: Mapping[str, Any],
         lines: Iterable[RenderableType],
-        *,
         folder: Path | None,
         page: str,
+        *,
         notes: Iterable[str] = (),
     ) -> None:
         """Print a result, what there is to say of it, and the folder where it was written."""
@@ -222,14 +222,7 @@ def duration(seconds: float) -> str:
 def failures(messages: Messages) -> Iterator[None]:
     """Turn whatever a command raises into one line and an exit status."""
 
-    def show(
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        *_: Any,
-        **__: Any,
-    ) -> None:
+    def show(message: Any, category: type, filename: str, lineno: int, *_: Any, **__: Any) -> None:
         where = f" ({category.__name__}, {Path(filename).name}:{lineno})"
         messages.note(f"warning: {message}{where if messages.debug else ''}")
 

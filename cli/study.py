@@ -240,16 +240,14 @@ def benchmark_table(study: Mapping[str, Any]) -> Table:
         entry = study.get(mode, {})
         for name, values in entry.items():
             if isinstance(values, Mapping) and "spread_over_crb" in values:
-                low, high = values["spread_over_crb_ci95"]
-                failed = f"{entry['failed']} of {entry['trials']}"
-                place = {"mode": mode, "name": name, "failed": failed}
-                records.append({**values, "low": low, "high": high, **place})
+                records.append({**entry, **values, "mode": mode, "name": name})
     return listing(
         records,
         "mode | parameter | bias | spread | CRB | QCRB | spread/CRB | 95 % interval | "
         "coverage 68 % | failed",
         "{mode} | {name} | {bias:.3g} | {spread:.3g} | {crb:.3g} | {qcrb:.3g} | "
-        "{spread_over_crb:.3g} | {low:.3g}–{high:.3g} | {coverage68:.3g} | {failed}",
+        "{spread_over_crb:.3g} | {spread_over_crb_ci95[0]:.3g}–{spread_over_crb_ci95[1]:.3g} | "
+        "{coverage68:.3g} | {failed} of {trials}",
         left=(0, 1),
     )
 
@@ -404,25 +402,24 @@ def _publish(
 
 def _scores_table(scores: Mapping[str, Any]) -> Table:
     """Tabulate efficiency and what belongs to it, one row for each parameter of each estimator."""
-    numbers = ("efficiency_crb", "low", "high", "bias", "rmse", "crb", "qcrb", "pull_std")
+    numbers = ("efficiency_crb", "bias", "rmse", "crb", "qcrb", "pull_std")
     records: list[dict[str, Any]] = []
     for part, entries in scores["parts"].items():
         for who, entry in entries["estimators"].items():
-            place, trials = {"part": part, "who": who}, entry["trials"]
-            if entry["failed"] == trials:
-                nothing = {**dict.fromkeys(numbers), "name": "–", "answered": 0}
-                records.append({**nothing, **place, "trials": trials})
+            place = {"part": part, "who": who, "trials": entry["trials"]}
+            if entry["failed"] == entry["trials"]:
+                nothing = {"efficiency_crb_ci95": (None, None), "name": "–", "answered": 0}
+                records.append({**dict.fromkeys(numbers), **nothing, **place})
             for name, found in entry.items():
                 if isinstance(found, Mapping) and "efficiency_crb" in found:
-                    low, high = found["efficiency_crb_ci95"]
-                    ends = {"low": low, "high": high}
-                    records.append({**found, **ends, **place, "name": name, "trials": trials})
+                    records.append({**found, **place, "name": name})
     return listing(
         records,
         "part | estimator | parameter | efficiency | 95 % | bias | rmse | CRB | QCRB | pull σ"
         " | answered",
-        "{part} | {who} | {name} | {efficiency_crb:.3g} | {low:.3g}–{high:.3g} | {bias:.3g} |"
-        " {rmse:.3g} | {crb:.3g} | {qcrb:.3g} | {pull_std:.3g} | {answered} of {trials}",
+        "{part} | {who} | {name} | {efficiency_crb:.3g} | {efficiency_crb_ci95[0]:.3g}–"
+        "{efficiency_crb_ci95[1]:.3g} | {bias:.3g} | {rmse:.3g} | {crb:.3g} | {qcrb:.3g} | "
+        "{pull_std:.3g} | {answered} of {trials}",
     )
 
 

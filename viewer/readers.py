@@ -11,15 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis import (
-    DataError,
-    Stack,
-    Status,
-    StoredResult,
-    open_result,
-    open_stack,
-    tracked_rows,
-)
+import iscat_analysis as ia
 from iscat_analysis.pipeline.preview import film_limits
 from iscat_analysis.report.figures import SHOWN_FRAMES
 
@@ -65,7 +57,7 @@ class LazyFrames:
 class LazyMovie(LazyFrames):
     """The counts of an open movie; it is closed when nothing shows it any more."""
 
-    def __init__(self, stack: Stack) -> None:
+    def __init__(self, stack: ia.Stack) -> None:
         super().__init__(stack.shape, stack.dtype, lambda t: stack.read(t, t + 1)[0])
         self.stack = stack
         weakref.finalize(self, stack.close)
@@ -84,14 +76,14 @@ def movie_reader(path: str | Sequence[str]) -> Callable[[Any], list[LayerData]] 
         return None
     if Path(path).is_dir() and Path(path).suffix.lower() != ".zarr":
         return None
-    return lambda path: [movie_layer(LazyMovie(open_stack(path)))]
+    return lambda path: [movie_layer(LazyMovie(ia.open_stack(path)))]
 
 
 def result_reader(path: str | Sequence[str]) -> Callable[[Any], list[LayerData]] | None:
     """Tell whether this is the output folder of a movie."""
     if not isinstance(path, str) or not _is_result(Path(path)):
         return None
-    return lambda path: result_layers(open_result(path))
+    return lambda path: result_layers(ia.open_result(path))
 
 
 def _is_result(path: Path) -> bool:
@@ -105,12 +97,12 @@ def movie_layer(movie: LazyMovie) -> LayerData:
     return movie, options, "image"
 
 
-def result_layers(result: StoredResult) -> list[LayerData]:
+def result_layers(result: ia.StoredResult) -> list[LayerData]:
     """Make the layers of a result."""
     layers: list[LayerData] = []
     name = result.folder.name
-    with contextlib.suppress(DataError):  # the table is worth looking at without the movie
-        layers.append(movie_layer(LazyMovie(open_stack(result.movie_path))))
+    with contextlib.suppress(ia.DataError):  # the table is worth looking at without the movie
+        layers.append(movie_layer(LazyMovie(ia.open_stack(result.movie_path))))
     if result.tracks is not None:
         layers += _tracks_layer(result)
     table = result.table
@@ -122,7 +114,7 @@ def result_layers(result: StoredResult) -> list[LayerData]:
         points[:, 0] /= SHOWN_FRAMES
     elif result.tracks is None:  # they are there in all frames after the background
         points, scale = points[:, 1:], scale[1:]
-    colours = ["lime" if status == Status.OK else "orange" for status in placed["status"]]
+    colours = ["lime" if status == ia.Status.OK else "orange" for status in placed["status"]]
     options = {
         "name": f"{name} events",
         "features": placed.assign(**{ROW: placed.index}).reset_index(drop=True),
@@ -137,9 +129,9 @@ def result_layers(result: StoredResult) -> list[LayerData]:
     return [*layers, (points, options, "points")]
 
 
-def _tracks_layer(result: StoredResult) -> list[LayerData]:
+def _tracks_layer(result: ia.StoredResult) -> list[LayerData]:
     """Make the layer of tracks; the features of a place are its row, and its track's."""
-    rows = tracked_rows(result.table)
+    rows = ia.tracked_rows(result.table)
     if not len(rows) or result.tracks is None:
         return []
     whole = result.tracks.set_index("track").add_prefix("track_")

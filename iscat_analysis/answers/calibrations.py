@@ -11,16 +11,8 @@ from typing import Any, Unpack
 import numpy as np
 import pandas as pd
 
+from iscat_analysis import calibration
 from iscat_analysis.answers.output import Writing, folder_for, tell
-from iscat_analysis.calibration import (
-    LEAST_EVENTS,
-    ContrastPeak,
-    Landing,
-    MassCalibration,
-    calibrate_mass,
-    find_contrast_peaks,
-    standards_of,
-)
 from iscat_analysis.calibration.line import made_with, measured_contrasts
 from iscat_analysis.camera import CameraCalibration, measure_camera
 from iscat_analysis.config import Config
@@ -139,10 +131,10 @@ def mass_calibration(
     *,
     standards_se_kda: Sequence[float] | None = None,
     peaks_at: Sequence[float] | None = None,
-    landing: Landing | None = None,
+    landing: calibration.Landing | None = None,
     standards: Config | None = None,
     **writing: Unpack[Writing],
-) -> MassCalibration:
+) -> calibration.MassCalibration:
     """Calibrate contrast against standards and write what was found.
 
     The configuration of their analysis, which says with what optics they were measured, is that
@@ -155,7 +147,7 @@ def mass_calibration(
     if landing is None:
         landing = _landing(contrast, table["mass_kda"].to_numpy(float))
     sigma = table["sigma_contrast"].to_numpy(float) if "sigma_contrast" in table else None
-    found = calibrate_mass(
+    found = calibration.calibrate_mass(
         contrast,
         standards_kda,
         standards_se_kda=standards_se_kda,
@@ -169,7 +161,7 @@ def mass_calibration(
         unknown = NO_RECORDED_OPTICS(where=str(events))
         found = replace(found, findings=(*found.findings, unknown))
     else:
-        found = replace(found, recorded=standards_of(standards))
+        found = replace(found, recorded=calibration.standards_of(standards))
     tell(found.notes, folder.notify)
     direction = -1.0 if found.landing == "dark" else 1.0
     size = direction * contrast[direction * contrast > 0]
@@ -190,7 +182,7 @@ def mass_calibration(
     return found
 
 
-def contrast_peaks(events: Path) -> tuple[FloatArray, list[ContrastPeak]]:
+def contrast_peaks(events: Path) -> tuple[FloatArray, list[calibration.ContrastPeak]]:
     """Give the |contrast| of the landings in a table, and the peaks that it has.
 
     Shapes: result (n,).
@@ -203,9 +195,9 @@ def contrast_peaks(events: Path) -> tuple[FloatArray, list[ContrastPeak]]:
     if "sigma_contrast" in table:
         sigma = table["sigma_contrast"].to_numpy(float)
     known = (size > 0) & np.isfinite(size) & np.isfinite(sigma)
-    if np.count_nonzero(known) < LEAST_EVENTS:
+    if np.count_nonzero(known) < calibration.LEAST_EVENTS:
         return size[known], []
-    return size[known], find_contrast_peaks(size[known], sigma[known])
+    return size[known], calibration.find_contrast_peaks(size[known], sigma[known])
 
 
 def read_contrasts(path: Path) -> pd.DataFrame:
@@ -213,7 +205,7 @@ def read_contrasts(path: Path) -> pd.DataFrame:
     return measured_contrasts(read_events(path), path)
 
 
-def _landing(contrast: np.ndarray[Any, Any], mass: np.ndarray[Any, Any]) -> Landing:
+def _landing(contrast: np.ndarray[Any, Any], mass: np.ndarray[Any, Any]) -> calibration.Landing:
     """Find the sign of landing from the masses of a table; dark where there are none."""
     product = contrast * mass
     product = product[np.isfinite(product)]

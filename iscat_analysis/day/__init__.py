@@ -21,27 +21,10 @@ import pandas as pd
 from iscat_analysis.answers.output import Notify, tell
 from iscat_analysis.calibration.line import with_line
 from iscat_analysis.config import Config, configure
+from iscat_analysis.day import compare, gather
 from iscat_analysis.day.calibrate import Day, calibrate_day
-from iscat_analysis.day.compare import (
-    Reaction,
-    Series,
-    find_equilibria,
-    kd_name,
-    kd_table,
-    match_species,
-    reaction_of,
-    shifts,
-)
-from iscat_analysis.day.gather import (
-    MOVIE_COLUMNS,
-    SPECIES_COLUMNS,
-    Found,
-    movie_table,
-    poisson_rate,
-    read_movie,
-    species_table,
-    write_events,
-)
+from iscat_analysis.day.compare import Reaction
+from iscat_analysis.day.gather import MOVIE_COLUMNS, Found
 from iscat_analysis.day.jobs import Outcome, Runner, claim_folder, hash_of, write_whole
 from iscat_analysis.day.table import (
     Movie,
@@ -245,7 +228,7 @@ def batch(
 
 def checked_options(options: DayOptions) -> tuple[Reaction | None, Standards, Config]:
     """Check options of a day: the reaction, the standards, and the configuration of all movies."""
-    reaction = reaction_of(options["kd"], options["kd_masses_kda"])
+    reaction = compare.reaction_of(options["kd"], options["kd_masses_kda"])
     try:
         named = read_standards(options["standards"] or ())
     except ValueError as error:
@@ -311,7 +294,7 @@ def _gathered(
             runner.records.drop("page")
             found: list[Found] = []
             for movie in ordered:
-                found.append(read_movie(movie, outcomes[movie.name], _result(out, movie)))
+                found.append(gather.read_movie(movie, outcomes[movie.name], _result(out, movie)))
                 runner.progress("gather", len(found), len(ordered))
             publish_day(plan, day, found, reaction, part.failed, out)
             runner.records.write("page", {"key": key})
@@ -323,7 +306,7 @@ def _gathered(
     words = dict.fromkeys(("condition", "model", "masses_kda", "remarks", "why"), str)
     kd = _read(out / "kd.csv", words).fillna(dict.fromkeys(words, ""))
     absent = kd[kd["why"] != ""]
-    without = zip(map(kd_name, absent["condition"]), absent["why"], strict=True)
+    without = zip(map(compare.kd_name, absent["condition"]), absent["why"], strict=True)
     return replace(part, kd=kd, failed=(*part.failed, *without))
 
 
@@ -344,13 +327,13 @@ def publish_day(
     out: Path,
 ) -> None:
     """Write the tables and the page of all movies; each file is written whole or not at all."""
-    movies = movie_table(plan, day, found, out)
-    species = match_species(species_table(found))[list(SPECIES_COLUMNS)]
-    shifted = shifts(species[species["role"] != "calibrant"], reference_of(found))
-    series = [] if reaction is None else find_equilibria(found, reaction)
+    movies = gather.movie_table(plan, day, found, out)
+    species = compare.match_species(gather.species_table(found))[list(gather.SPECIES_COLUMNS)]
+    shifted = compare.shifts(species[species["role"] != "calibrant"], reference_of(found))
+    series = [] if reaction is None else compare.find_equilibria(found, reaction)
     tables = {"movies": movies, "species": species, "shifts": shifted}
     if reaction is not None:
-        tables["kd"] = kd_table(series, reaction)
+        tables["kd"] = compare.kd_table(series, reaction)
     else:
         (out / "kd.csv").unlink(missing_ok=True)
     for name, table in tables.items():
@@ -363,7 +346,7 @@ def publish_day(
     write_whole(out / "batch.html", page)
     own = movies[list(movies.columns[len(MOVIE_COLUMNS) :])]
     with whole_file(out / "events.parquet") as partial:
-        write_events(found, own, partial)
+        gather.write_events(found, own, partial)
 
 
 def _figure_files(folder: Path) -> set[str]:
@@ -377,7 +360,7 @@ def _page(
     day: Day,
     found: Sequence[Found],
     tables: Mapping[str, pd.DataFrame],
-    series: Sequence[Series],
+    series: Sequence[compare.Series],
     failed: Sequence[tuple[str, str]],
     folder: Path,
 ) -> str:
@@ -389,7 +372,7 @@ def _page(
     exposure = movies["seconds_searched" if per_second else "frames_searched"].to_numpy(float)
     exposure = exposure if per_second else exposure / 1000
     counted = zip(movies["landings"].astype(float), exposure, strict=True)
-    rates = [poisson_rate(landings, time) for landings, time in counted]
+    rates = [gather.poisson_rate(landings, time) for landings, time in counted]
     shown = movies.assign(
         group=[groups[name] for name in movies["movie"]],
         rate=[rate[0] for rate in rates],
@@ -410,7 +393,10 @@ def _page(
             if each.binding is not None
         ],
         calibrations=_calibrations(day),
-        failed=[*failed, *((kd_name(each.condition), each.why) for each in series if each.why)],
+        failed=[
+            *failed,
+            *((compare.kd_name(each.condition), each.why) for each in series if each.why),
+        ],
         mass_label="mass [kDa]" if scales <= {"calibration"} else "mass, model scale [kDa]",
     )
     return batch_page(plan.table.title, summary_line(movies), contents, folder)

@@ -22,17 +22,12 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri, stdtr, stdtrit
 
-from iscat_analysis.answers.binding import (
-    CONCENTRATIONS,
-    Binding,
-    check_reaction,
-    fit_kd,
-    with_events,
-)
+from iscat_analysis.answers import binding as of
 from iscat_analysis.day.gather import Found
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.findings import existing
 from iscat_analysis.records import FloatArray
+from iscat_analysis.schemas.answers import DayKd
 from iscat_analysis.species import LEAST_EVENTS
 from iscat_analysis.species.equilibrium import Model
 from iscat_analysis.species.maximum import TWO_SIDED_95
@@ -207,10 +202,7 @@ def holm(p_values: FloatArray) -> FloatArray:
     return corrected
 
 
-KD_COLUMNS = (
-    "condition", "model", "movies", "kd_nm", "kd_low", "kd_high", "inactive_p", "p_value",
-    "masses_kda", "remarks", "why",
-)  # fmt: skip
+KD_COLUMNS = tuple(DayKd.model_fields)
 """Columns of ``kd.csv``: K_D with its 95 % interval [nM], the chance of such a gain by an inactive
 part where there is none, the chance of at least such a distance from the equilibrium where it
 holds, masses of the species, remarks, and why there is no K_D."""
@@ -230,7 +222,7 @@ class Series:
 
     condition: str
     movies: int
-    binding: Binding | None
+    binding: of.Binding | None
     remarks: tuple[str, ...] = ()
     why: str = ""
 
@@ -241,13 +233,13 @@ def reaction_of(kd: Model | None, kd_masses_kda: Sequence[float] | None) -> Reac
         if kd_masses_kda is not None:
             raise ConfigError("`kd_masses_kda` is of K_D: give `kd`, dimer or ab, as well")
         return None
-    check_reaction(kd, kd_masses_kda, names=("kd", "kd_masses_kda"))
+    of.check_reaction(kd, kd_masses_kda, names=("kd", "kd_masses_kda"))
     return Reaction(kd, None if kd_masses_kda is None else tuple(map(float, kd_masses_kda)))
 
 
 def find_equilibria(found: Sequence[Found], reaction: Reaction) -> list[Series]:
     """Fit an equilibrium constant to each condition with samples of several concentrations."""
-    columns = CONCENTRATIONS[reaction.model]
+    columns = of.CONCENTRATIONS[reaction.model]
     conditions: dict[str, list[Found]] = {}
     for each in found:
         if each.movie.row.role == "sample" and each.summary and _totals(each, columns):
@@ -301,7 +293,7 @@ def _fit(
 ) -> Series:
     """Fit all movies of a condition that have enough events."""
     tables = [event_table(each.folder, name=each.movie.name) for each in members]
-    kept, few = with_events(tables)
+    kept, few = of.with_events(tables)
     remarks = tuple(finding.text for finding in existing([few]))
     used = [each for each, keep in zip(members, kept, strict=True) if keep]
     if not used:
@@ -311,7 +303,7 @@ def _fit(
         for each in used
     ]
     try:
-        binding = fit_kd(
+        binding = of.fit_kd(
             pd.DataFrame(rows),
             model=reaction.model,
             masses_kda=reaction.masses_kda,

@@ -23,6 +23,7 @@ from iscat_analysis.day.jobs import Outcome
 from iscat_analysis.day.table import Movie, Plan
 from iscat_analysis.records import FloatArray, Status
 from iscat_analysis.report.answer import answer_in
+from iscat_analysis.schemas.answers import DayMovie, DaySpecies
 from iscat_analysis.species.describe import poisson_interval
 from iscat_analysis.species.maximum import TWO_SIDED_95
 from iscat_analysis.units import count
@@ -30,23 +31,10 @@ from iscat_analysis.units import count
 LABELS = ("movie", "sample", "condition", "concentration_nm", "replicate", "role")
 """What tells a movie in every table."""
 
-MOVIE_COLUMNS = (
-    *LABELS, "path", "state", "why", "cautions", "report", "events", "ok", "landings", "leavings",
-    "species", "main_mass_kda", "answer", "rate_per_s", "rate_low", "rate_high", "rate_per_um2_s",
-    "frames_searched", "seconds_searched", "field_um2", "frames", "drift_px", "focus_shift_nm",
-    "noise_over_shot", "noise_frames", "median_p_value", "small_p_values", "repeat_over_crb",
-    "standards_seen", "optics", "mass_scale", "outside_standards", "remarks", "sha256",
-)  # fmt: skip
+MOVIE_COLUMNS = tuple(dict.fromkeys((*LABELS, "path", *DayMovie.model_fields)))
 """Columns of ``movies.csv``, before those of the table that have no meaning here."""
 
-SPECIES_COLUMNS = (
-    *LABELS, "kind", "mass_kda", "mass_se", "mass_low", "mass_high", "mass_systematic",
-    "width_kda", "width_low", "width_high", "count", "count_low", "count_high",
-    "fraction", "fraction_low", "fraction_high", "share", "share_low", "share_high",
-    "count_corrected", "corrected_low",
-    "corrected_high", "landing", "leaving", "efficiency", "rate_per_s", "rate_low", "rate_high",
-    "outlier",
-)  # fmt: skip
+SPECIES_COLUMNS = tuple(DaySpecies.model_fields)
 """Columns of ``species.csv``; `kind` is the same for species of several movies with one mass.  A
 `share` is of the particles that came, as `fraction` is, but without outliers: one event far below
 the detection limit stands for any number of particles, and would take the others' fractions."""

@@ -18,22 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.camera import (
-    Camera,
-    LearnedCamera,
-    LightModel,
-    Processing,
-    Response,
-    camera_from_config,
-    find_processing,
-    refuse_overflow,
-    refuse_ratio,
-    resolve_metadata,
-    text_finding,
-    whole_frames,
-    with_camera,
-    without_text,
-)
+from iscat_analysis import camera as cameras
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.causes import axes_warning
 from iscat_analysis.diagnosis.frames import KeptFrames, refuse_channels, without_repeats
@@ -88,13 +73,13 @@ class Prepared:
     steady: Stack
     config: Config
     asked: Config
-    known: LearnedCamera
+    known: cameras.LearnedCamera
     ahead: bool = False
     notify: Notify = notify_nobody
     stretches: Stretches = field(default_factory=lambda: Stretches(()))
     kept: KeptFrames | None = None
-    processing: Processing | None = None
-    lines: LightModel | None = None
+    processing: cameras.Processing | None = None
+    lines: cameras.LightModel | None = None
     opening: NoiseSurvey | None = None
     changes: Future[Changes] | None = None
     other_kind: str = ""
@@ -106,12 +91,12 @@ class Prepared:
         return self.config.fit.follows_tracks
 
     @property
-    def camera(self) -> Camera:
+    def camera(self) -> cameras.Camera:
         """The camera, as it is configured until its numbers are learned."""
         return self.known.camera
 
     @property
-    def response(self) -> Response | None:
+    def response(self) -> cameras.Response | None:
         """Response curve of the camera, where the counts show one."""
         return self.known.response
 
@@ -172,7 +157,7 @@ def metadata(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
     if not config.optics.interferes:
         darkfield_photons(config.particle)
     movie = state.movie.channel(config.camera.channels)
-    config, notes = resolve_metadata(config, movie.metadata)
+    config, notes = cameras.resolve_metadata(config, movie.metadata)
     findings: list[Finding | None] = [
         *(FILE_IMPLIES({"text": note}) for note in movie.notes),
         *notes,
@@ -208,14 +193,14 @@ def camera(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
     """Refuse what is no camera's movie, learn the camera's numbers, and leave out burnt-in text."""
     movie, config, stated = state.movie, state.config, state.camera
     name, learned_from = movie.name, state.learned_from
-    refuse_ratio(movie.read(0, 1)[0], f"{name}: frame 0", stated)
+    cameras.refuse_ratio(movie.read(0, 1)[0], f"{name}: frame 0", stated)
     refuse_channels(movie.read(*_first_frames(state)), stated, name)
-    movie, config, known = with_camera(movie, config, learned_from)
+    movie, config, known = cameras.with_camera(movie, config, learned_from)
     findings = [*(replace(one, where=name) for one in known.findings), law_finding(known, name)]
     stored = state.stored
     if known.text is not None:
-        stored = without_text(stored, known.text, known.camera)
-        findings.append(text_finding(known.text, name))
+        stored = cameras.without_text(stored, known.text, known.camera)
+        findings.append(cameras.text_finding(known.text, name))
     findings.append(known.padding(name))
     if state.config.camera.assumed is not state.config.camera:
         findings.append(of.CAMERA_NUMBERS({"text": known.description}, where=name))
@@ -237,12 +222,12 @@ def repeats(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
 def counts(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
     """Refuse counts that no camera gives, and find what was done to them before."""
     movie, name = state.movie, state.movie.name
-    processing = find_processing(movie, state.camera, state.span, moving=state.tracked)
+    processing = cameras.find_processing(movie, state.camera, state.span, moving=state.tracked)
     start, stop = _first_frames(state)
     seen = movie.read(start, stop)
     if not state.config.background.slides:  # windows that slide pass over frames that repeat
         _refuse_still(seen, f"{name}: frames {start} to {stop - 1}")
-    refuse_overflow(state.stored.read(start, stop), name)
+    cameras.refuse_overflow(state.stored.read(start, stop), name)
     findings = [axes_warning(name, seen)]
     if processing is None:
         return state, findings
@@ -298,8 +283,8 @@ def calibrated(
     ahead: bool = False,
 ) -> Prepared:
     """Take a movie through steps; `ahead` where an analysis follows."""
-    stated = camera_from_config(config.camera, movie.shape[1:], movie.dtype)
-    known = LearnedCamera(config.camera, stated, {}, ())
+    stated = cameras.camera_from_config(config.camera, movie.shape[1:], movie.dtype)
+    known = cameras.LearnedCamera(config.camera, stated, {}, ())
     state = Prepared(movie, movie, movie, movie, config, config, known, ahead, notify)
     for step in steps:
         state, findings = step(state)
@@ -311,7 +296,7 @@ def calibrated(
 def _first_frames(state: Prepared) -> tuple[int, int]:
     """Give the few frames that are looked at before anything else."""
     start, stop = state.learned_from
-    return start, max(start, min(stop, start + whole_frames(state.shape, 64)))
+    return start, max(start, min(stop, start + cameras.whole_frames(state.shape, 64)))
 
 
 def _landing_light(state: Prepared, config: Config) -> tuple[JudgedLight, NoiseSurvey, str]:

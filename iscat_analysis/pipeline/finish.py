@@ -223,7 +223,7 @@ def summary_of(
     table: pd.DataFrame,
     compared: Compared,
     timings: Mapping[str, float],
-    achieved: Mapping[str, EmpiricalSpread] = MappingProxyType({}),
+    achieved: Mapping[str, EmpiricalSpread],
 ) -> dict[str, Any]:
     """Gather counts, medians and efficiency, for ``summary.json``; `species_of` has the rest."""
     rows = tally(table)
@@ -269,8 +269,6 @@ def summary_of(
             "n_scattered": _median(good["n_scattered"]),
         },
         "precision": precision,
-        "distribution": None,
-        "across_particles": [],
         "seconds": {name: round(value, 3) for name, value in timings.items()},
     }
 
@@ -452,18 +450,9 @@ def mass_scale_of(config: Config) -> str:
     return "calibration" if config.calibration else "absolute model"
 
 
-@dataclass(frozen=True)
-class ReportedRows:
-    """The rows of all events of a movie, and what all events together say."""
-
-    table: pd.DataFrame
-    checked: Checked
-    budget: list[dict[str, Any]]
-
-
 def reported_rows(
     found: DetectionResult, summary: Mapping[str, Any] = MappingProxyType({})
-) -> ReportedRows:
+) -> tuple[pd.DataFrame, Checked, list[dict[str, Any]]]:
     """Make the rows of all events of a movie; the summary has sections on optics and camera."""
     config, mode = found.context.config, found.context.mode
     seen = checked(found)
@@ -500,7 +489,7 @@ def reported_rows(
             unknown = systematic.SPHERES
         scaled = config.fit.sigma == "measured"
         budget = systematic.budget_of(table, shared, seen.achieved, unknown=unknown, scaled=scaled)
-    return ReportedRows(table, seen, budget)
+    return table, seen, budget
 
 
 CHECKS: tuple[Callable[[DetectionResult, pd.DataFrame], Finding | None], ...] = (
@@ -541,8 +530,7 @@ def make_analysis(
     if found.optics:
         further["optics"] = found.optics
     further |= extra
-    rows = reported_rows(found, further)
-    table, seen, budget = rows.table, rows.checked, rows.budget
+    table, seen, budget = reported_rows(found, further)
     recorded = ready.whole.metadata.ticks
     ticks = None if recorded is None else np.array(recorded)
     if ticks is not None and table["frame"].notna().all():
@@ -598,7 +586,9 @@ def make_analysis(
         "warnings": run.findings.warnings,
         **described,
     }
-    frames, first = _unique_frames(compared)
+    spans = compared.frames_before, compared.frames_after
+    both = np.concatenate([np.arange(*span, dtype=np.int64) for span in spans])
+    frames, first = np.unique(both, return_index=True)
     return Analysis(
         config_toml=config_to_toml(as_given(config)),
         mode=context.mode,
@@ -657,14 +647,3 @@ def _tracks(
     films = make_films(context, ready.steady, ready.camera, backgrounds, table, tracks)
     run.clock.lap("tracks")
     return tracks, films, summary
-
-
-def _unique_frames(compared: Compared) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    """Sort the frames of both ranges, each once, and give the index of each in the power.
-
-    Where particles move, both ranges are the whole movie, so that every frame is in it twice.
-    """
-    ranges = compared.frames_before, compared.frames_after
-    both = np.concatenate([np.arange(*span, dtype=np.int64) for span in ranges])
-    frames, first = np.unique(both, return_index=True)
-    return frames, first

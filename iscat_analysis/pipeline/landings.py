@@ -152,7 +152,7 @@ def inject_and_recover(ready: Prepared, run: Run, result: DetectionResult) -> di
     )
     if again.interrupted:
         raise KeyboardInterrupt
-    rows = counted(reported_rows(again).table)
+    rows = counted(reported_rows(again)[0])
     searched = again.summary["searched_share"] or 1.0
     return _recovery(particles, rows, result.context, frames[1], window, searched)
 

@@ -19,12 +19,7 @@ from iscat_analysis.fitting.field import add_signal
 from iscat_analysis.fitting.ranges import checked, fitted_frames
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Run
-from iscat_analysis.pipeline.before_after import (
-    BEFORE_AFTER,
-    Background,
-    StoredEvents,
-    find_before_after,
-)
+from iscat_analysis.pipeline import before_after
 from iscat_analysis.pipeline.kinds import Kind, Look, candidate_table, with_threshold
 from iscat_analysis.records import EventView, FloatArray, Windows, silent
 from iscat_analysis.threads import threads
@@ -49,7 +44,7 @@ if TYPE_CHECKING:
 
 
 def track_in_frames(
-    ready: Prepared, run: Run, ground: Background, pool: ThreadPoolExecutor
+    ready: Prepared, run: Run, ground: before_after.Background, pool: ThreadPoolExecutor
 ) -> DetectionResult:
     """Fit each frame by itself over a recorded background, and link the fits."""
     movie, camera, windows = ready.steady, ready.camera, ground.windows
@@ -61,7 +56,7 @@ def track_in_frames(
     return replace(found, summary=ground.summary)
 
 
-class StoredInDarkField(StoredEvents):
+class StoredInDarkField(before_after.StoredEvents):
     """Draws rows over a background that is learnt with the tracks."""
 
     def made_context(self) -> AnalysisContext:
@@ -218,8 +213,10 @@ def _judge_beside_particles(
     return noise.compared_with_fits(table["chi2_reduced"].to_numpy(float))
 
 
-FRAME_BY_FRAME = replace(BEFORE_AFTER, find=partial(find_before_after, fit=track_in_frames))
+FRAME_BY_FRAME = replace(
+    before_after.BEFORE_AFTER, find=partial(before_after.find_before_after, fit=track_in_frames)
+)
 MOVING_IN_DARK_FIELD = replace(
-    BEFORE_AFTER, find=find_moving, stored=StoredInDarkField, keeps_parts=True
+    before_after.BEFORE_AFTER, find=find_moving, stored=StoredInDarkField, keeps_parts=True
 )
 MOVING = Kind("blocks", find_moving, MovingSearch, StoredTracks)

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -149,9 +150,7 @@ def write_setup(
             )
         here = {each.key for each in values}
         values += [
-            Value(key, _config_value(_DEFAULTS, key), DEFAULT)
-            for key in _STANDING
-            if key not in here
+            Value(key, attrgetter(key)(_DEFAULTS), DEFAULT) for key in _STANDING if key not in here
         ]
         preview = Preview(stack, config)
         mode, preview = _mode_of(preview, stack, config)
@@ -223,7 +222,7 @@ def _ask_the_rest(
                 note(str(error))
         if answer is None:
             continue
-        given = _config_value(config, question.key)
+        given = attrgetter(question.key)(config)
         values.append(Value(question.key, given, DEFAULT if given == question.default else ANSWER))
     config = configure(None, settings={each.key: each.value for each in values})
     return values, config
@@ -343,11 +342,6 @@ def _metadata_line(stack: Stack) -> str:
 
 def _origin_in_file(metadata: StackMetadata) -> str:
     return f"{READ} ({metadata.source})"
-
-
-def _config_value(config: Config, key: str) -> Any:
-    section, _, name = key.partition(".")
-    return getattr(getattr(config, section), name)
 
 
 def preview_lines(setup: Setup) -> list[str]:

@@ -91,10 +91,8 @@ class StoredResult:
         try:
             self.table: pd.DataFrame = read_parquet(folder / "fits.parquet")
             self.summary: Mapping[str, Any] = read_json(folder / "summary.json")
-            tracked = (folder / "tracks.parquet").is_file()
-            self.tracks: pd.DataFrame | None = (
-                read_parquet(folder / "tracks.parquet") if tracked else None
-            )
+            tracks = folder / "tracks.parquet"
+            self.tracks: pd.DataFrame | None = read_parquet(tracks) if tracks.is_file() else None
         except FileNotFoundError as error:
             missing = Path(error.filename).name if error.filename else "such file"
             raise DataError(

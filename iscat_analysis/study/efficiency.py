@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.bounds import Experiment, plan
+from iscat_analysis.bounds import plan
+from iscat_analysis.bounds.experiment import height_of, reach_of
 from iscat_analysis.config import Config, configure
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import choice_in, number_in
@@ -156,7 +157,10 @@ def limits_of_many(
 
     Shapes: `truths` (n, 4).
     """
-    experiment = _experiment(config, float(truths[:, 2].max()) + _Z_STEP_NM)
+    highest = max(truths[:, 2].max() + _Z_STEP_NM, height_of(config))
+    highest = max(float(highest), config.particle.nominal_height_nm)
+    model = forward_model(config, reach_of(config), z_max_nm=highest)
+    experiment = plan(config, model=model)
     height = np.round(truths[:, 2] / _Z_STEP_NM) * _Z_STEP_NM
     with np.errstate(divide="ignore", invalid="ignore"):
         mass = np.exp(np.round(np.log(np.abs(truths[:, 3])) / _MASS_STEP) * _MASS_STEP)
@@ -167,17 +171,6 @@ def limits_of_many(
     places = np.insert(kinds[:, :2], [0], [at.x_nm, at.y_nm], axis=1)
     one = limits_at(experiment, free, places, frames=kinds[:, 2:].astype(int).tolist())
     return one.for_rows(inverse.reshape(-1).tolist())
-
-
-def _experiment(config: Config, highest_nm: float) -> Experiment:
-    """Set up the experiment with a model that is known up to some height."""
-    pixel_nm = config.camera.pixel_size_nm
-    if pixel_nm is None:
-        return plan(config)  # which says what is missing
-    at = config.bounds
-    reach = math.hypot(*(at.pixels * pixel_nm / 2 + abs(v) for v in (at.x_nm, at.y_nm))) * 1.0001
-    z_max = max(highest_nm, config.particle.nominal_height_nm, at.z_nm or 0.0)
-    return plan(config, model=forward_model(config, reach, z_max_nm=z_max))
 
 
 def _resolved(setup: Setup, mode: str | None) -> tuple[Config, tuple[str, ...]]:
@@ -208,10 +201,9 @@ def matched(
         )
     if not len(truth):
         raise DataError("truth: has no rows")
-    z_nm = config.particle.nominal_height_nm if config.bounds.z_nm is None else config.bounds.z_nm
-    usual = (
-        {"z_nm": z_nm} if "mass_kda" in truth else {"z_nm": z_nm, "mass_kda": plan(config).mass_kda}
-    )
+    usual = {"z_nm": height_of(config)}
+    if "mass_kda" not in truth:
+        usual["mass_kda"] = plan(config).mass_kda
     truths = np.empty((len(truth), 4))
     for k, name in enumerate(PARAMETERS):
         if name not in truth and name in estimates and name not in usual:

@@ -145,7 +145,10 @@ class Movie:
         self.background_e = self._sample_e[self._field]
         noise = self._generator("power").standard_normal(simulation.frames)
         self.power = np.maximum(1 + simulation.power_noise * noise, 0.0)
-        self._signal_scale = self._scale()
+        self._signal_scale = 1.0
+        if not self._model.rho:
+            light = simulation.photons_per_pixel
+            self._signal_scale = photons_per_intensity(self._model, light, self._pixel_nm)
         self._check_range()
 
     @property
@@ -214,12 +217,9 @@ class Movie:
     def _light(self, frame: int, still: _Still) -> FloatArray:
         """Give the photoelectrons expected in a frame, particles that move among them."""
         current, spectrum = still.expected, still.spectrum
-        moving = [
-            (p, frame - p.first)
-            for p in self.movers
-            if not p.still and 0 <= frame - p.first < len(p.mean_nm)
-        ]
-        moving = [(p, i) for p, i in moving if self._near(p.mean_nm[i])]
+        there = ((p, frame - p.first) for p in self.movers if not p.still)
+        inside = ((p, i) for p, i in there if 0 <= i < len(p.mean_nm))
+        moving = [(p, i) for p, i in inside if self._near(p.mean_nm[i])]
         if moving:
             current = self._electrons(self._signal(still.field) + self._moving(moving, still.field))
             current = np.maximum(current, 0.0)
@@ -397,13 +397,6 @@ class Movie:
         finest = 2 * optics.na / optics.wavelength_nm * self._pixel_nm
         detail = np.hypot(fft.fftfreq(rows)[:, None], fft.rfftfreq(columns))
         return np.asarray(fft.irfft2(np.where(detail < finest, spectrum, 0.0), s=(rows, columns)))
-
-    def _scale(self) -> float:
-        if self._model.rho:
-            return 1.0
-        return photons_per_intensity(
-            self._model, self._config.simulation.photons_per_pixel, self._pixel_nm
-        )
 
     def _peak_contrasts(self) -> dict[tuple[float, float], float]:
         """Peak contrast for every height and mass that occurs."""
