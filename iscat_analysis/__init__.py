@@ -60,117 +60,86 @@ Names are imported when they are first used, so that ``import iscat_analysis`` i
 
 from __future__ import annotations
 
+import re
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from iscat_analysis.answers.binding import Binding as Binding
-    from iscat_analysis.answers.binding import fit_kd as fit_kd
-    from iscat_analysis.answers.comparing import compare_samples as compare_samples
-    from iscat_analysis.answers.comparing import compare_tables as compare_tables
-    from iscat_analysis.answers.kinetics import Kinetics as Kinetics
-    from iscat_analysis.answers.kinetics import fit_kinetics as fit_kinetics
-    from iscat_analysis.answers.species import find_species as find_species
-    from iscat_analysis.config import Calibration as Calibration
-    from iscat_analysis.config import Config as Config
+if TYPE_CHECKING:  # in the order of the manual
+    # isort: off
     from iscat_analysis.config import Optics as Optics
     from iscat_analysis.config import Particle as Particle
-    from iscat_analysis.config import config_to_toml as config_to_toml
-    from iscat_analysis.config import configure as configure
-    from iscat_analysis.config import instruments as instruments
-    from iscat_analysis.config import load_config as load_config
-    from iscat_analysis.day import Batch as Batch
-    from iscat_analysis.day import batch as batch
-    from iscat_analysis.day.watch import watch as watch
-    from iscat_analysis.errors import ConfigError as ConfigError
-    from iscat_analysis.errors import DataError as DataError
-    from iscat_analysis.errors import IscatError as IscatError
-    from iscat_analysis.movie import Stack as Stack
-    from iscat_analysis.movie import open_stack as open_stack
-    from iscat_analysis.notebook import Bounds as Bounds
-    from iscat_analysis.notebook import Result as Result
-    from iscat_analysis.notebook import calibrate_optics as calibrate_optics
-    from iscat_analysis.notebook import compute_bounds as compute_bounds
-    from iscat_analysis.notebook import fit_movie as fit_movie
-    from iscat_analysis.notebook import forecast_optics as forecast_optics
-    from iscat_analysis.notebook import simulate_movie as simulate_movie
     from iscat_analysis.pieces import Camera as Camera
-    from iscat_analysis.pieces import LogLikelihood as LogLikelihood
-    from iscat_analysis.pieces import crb as crb
+    from iscat_analysis.config import Calibration as Calibration
+    from iscat_analysis.pieces import psf as psf
     from iscat_analysis.pieces import fit_rods as fit_rods
     from iscat_analysis.pieces import fit_rois as fit_rois
     from iscat_analysis.pieces import log_likelihood as log_likelihood
-    from iscat_analysis.pieces import psf as psf
+    from iscat_analysis.pieces import LogLikelihood as LogLikelihood
+    from iscat_analysis.pieces import crb as crb
     from iscat_analysis.pieces import qcrb as qcrb
-    from iscat_analysis.pipeline import fit_stack as fit_stack
-    from iscat_analysis.pipeline.kinds import Look as Look
-    from iscat_analysis.pipeline.preview import Preview as Preview
-    from iscat_analysis.pipeline.stored import StoredResult as StoredResult
-    from iscat_analysis.pipeline.stored import open_result as open_result
-    from iscat_analysis.records import EVENT_COLUMNS as EVENT_COLUMNS
-    from iscat_analysis.records import FREE_PARAMETERS as FREE_PARAMETERS
-    from iscat_analysis.records import TRACK_COLUMNS as TRACK_COLUMNS
-    from iscat_analysis.records import Analysis as Analysis
-    from iscat_analysis.records import Status as Status
-    from iscat_analysis.records import TrackStatus as TrackStatus
-    from iscat_analysis.report.exchange import to_napari as to_napari
-    from iscat_analysis.report.exchange import to_photomol as to_photomol
-    from iscat_analysis.report.exchange import to_picasso as to_picasso
-    from iscat_analysis.report.exchange import to_trackpy as to_trackpy
-    from iscat_analysis.report.exchange import tracked_rows as tracked_rows
-    from iscat_analysis.schemas import schema as schema
-    from iscat_analysis.species import AnomalousTest as AnomalousTest
-    from iscat_analysis.species import Comparison as Comparison
-    from iscat_analysis.species import ConfinementTest as ConfinementTest
-    from iscat_analysis.species import Diffusion as Diffusion
-    from iscat_analysis.species import Distribution as Distribution
-    from iscat_analysis.species import anomalous_test as anomalous_test
-    from iscat_analysis.species import confinement_test as confinement_test
     from iscat_analysis.species import fit_diffusion as fit_diffusion
+    from iscat_analysis.species import Diffusion as Diffusion
+    from iscat_analysis.species import anomalous_test as anomalous_test
+    from iscat_analysis.species import AnomalousTest as AnomalousTest
+    from iscat_analysis.species import confinement_test as confinement_test
+    from iscat_analysis.species import ConfinementTest as ConfinementTest
     from iscat_analysis.species import hydrodynamic_diameter as hydrodynamic_diameter
     from iscat_analysis.species import refractive_index as refractive_index
+    from iscat_analysis.report.exchange import to_trackpy as to_trackpy
+    from iscat_analysis.report.exchange import to_napari as to_napari
+    from iscat_analysis.report.exchange import tracked_rows as tracked_rows
+    from iscat_analysis.pipeline.stored import open_result as open_result
+    from iscat_analysis.pipeline.stored import StoredResult as StoredResult
+    from iscat_analysis.pipeline.preview import Preview as Preview
+    from iscat_analysis.pipeline.kinds import Look as Look
+    from iscat_analysis.report.exchange import to_photomol as to_photomol
+    from iscat_analysis.report.exchange import to_picasso as to_picasso
+    from iscat_analysis.config import configure as configure
+    from iscat_analysis.day import batch as batch
+    from iscat_analysis.day import Batch as Batch
+    from iscat_analysis.day.watch import watch as watch
+    from iscat_analysis.notebook import fit_movie as fit_movie
+    from iscat_analysis.notebook import Result as Result
+    from iscat_analysis.notebook import simulate_movie as simulate_movie
+    from iscat_analysis.notebook import calibrate_optics as calibrate_optics
+    from iscat_analysis.answers.species import find_species as find_species
+    from iscat_analysis.answers.comparing import compare_samples as compare_samples
+    from iscat_analysis.answers.comparing import compare_tables as compare_tables
+    from iscat_analysis.answers.binding import fit_kd as fit_kd
+    from iscat_analysis.answers.binding import Binding as Binding
+    from iscat_analysis.answers.kinetics import fit_kinetics as fit_kinetics
+    from iscat_analysis.answers.kinetics import Kinetics as Kinetics
+    from iscat_analysis.species import Comparison as Comparison
+    from iscat_analysis.species import Distribution as Distribution
+    from iscat_analysis.notebook import compute_bounds as compute_bounds
     from iscat_analysis.study.efficiency import bounds_for as bounds_for
     from iscat_analysis.study.efficiency import efficiency as efficiency
     from iscat_analysis.study.estimator_setup import EstimatorSetup as EstimatorSetup
+    from iscat_analysis.notebook import forecast_optics as forecast_optics
+    from iscat_analysis.notebook import Bounds as Bounds
+    from iscat_analysis.config import Config as Config
+    from iscat_analysis.config import load_config as load_config
+    from iscat_analysis.config import instruments as instruments
+    from iscat_analysis.config import config_to_toml as config_to_toml
+    from iscat_analysis.movie import open_stack as open_stack
+    from iscat_analysis.movie import Stack as Stack
+    from iscat_analysis.pipeline import fit_stack as fit_stack
+    from iscat_analysis.records import Analysis as Analysis
+    from iscat_analysis.records import Status as Status
+    from iscat_analysis.records import EVENT_COLUMNS as EVENT_COLUMNS
+    from iscat_analysis.records import FREE_PARAMETERS as FREE_PARAMETERS
+    from iscat_analysis.records import TRACK_COLUMNS as TRACK_COLUMNS
+    from iscat_analysis.records import TrackStatus as TrackStatus
+    from iscat_analysis.errors import IscatError as IscatError
+    from iscat_analysis.errors import ConfigError as ConfigError
+    from iscat_analysis.errors import DataError as DataError
+    from iscat_analysis.schemas import schema as schema
+    # isort: on
 
-_NAMES = (
-    ("config", "Optics Particle"),
-    ("pieces", "Camera"),
-    ("config", "Calibration"),
-    ("pieces", "psf fit_rods fit_rois log_likelihood LogLikelihood crb qcrb"),
-    (
-        "species",
-        "fit_diffusion Diffusion anomalous_test AnomalousTest confinement_test ConfinementTest "
-        "hydrodynamic_diameter refractive_index",
-    ),
-    ("report.exchange", "to_trackpy to_napari tracked_rows"),
-    ("pipeline.stored", "open_result StoredResult"),
-    ("pipeline.preview", "Preview"),
-    ("pipeline.kinds", "Look"),
-    ("report.exchange", "to_photomol to_picasso"),
-    ("config", "configure"),
-    ("day", "batch Batch"),
-    ("day.watch", "watch"),
-    ("notebook", "fit_movie Result simulate_movie calibrate_optics"),
-    ("answers.species", "find_species"),
-    ("answers.comparing", "compare_samples compare_tables"),
-    ("answers.binding", "fit_kd Binding"),
-    ("answers.kinetics", "fit_kinetics Kinetics"),
-    ("species", "Comparison Distribution"),
-    ("notebook", "compute_bounds"),
-    ("study.efficiency", "bounds_for efficiency"),
-    ("study.estimator_setup", "EstimatorSetup"),
-    ("notebook", "forecast_optics Bounds"),
-    ("config", "Config load_config instruments config_to_toml"),
-    ("movie", "open_stack Stack"),
-    ("pipeline", "fit_stack"),
-    ("records", "Analysis Status EVENT_COLUMNS FREE_PARAMETERS TRACK_COLUMNS TrackStatus"),
-    ("errors", "IscatError ConfigError DataError"),
-    ("schemas", "schema"),
-)
-"""Module and names, in the order of the manual."""
-
-_HOME = {name: module for module, names in _NAMES for name in names.split()}
+_TYPED = re.compile(r"^    from (\S+) import (\w+) as", re.MULTILINE)
+_HOME = {name: module for module, name in _TYPED.findall(Path(__file__).read_text("utf-8"))}
+"""Module of each public name, as the list for type checkers has it."""
 
 __all__ = [*_HOME]
 
@@ -178,7 +147,7 @@ __all__ = [*_HOME]
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    return getattr(import_module(_HOME[name]), name)
 
 
 def __dir__() -> list[str]:

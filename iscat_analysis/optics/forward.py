@@ -21,7 +21,6 @@ from iscat_analysis.config import Calibration, Config, Optics, Particle
 from iscat_analysis.errors import ConfigError, ContrastError
 from iscat_analysis.last_used import memoize
 from iscat_analysis.optics.aperture import (
-    NEAR_CRITICAL,
     Aperture,
     aperture,
     aperture_on,
@@ -37,18 +36,6 @@ from iscat_analysis.optics.scatterers import Rod, Sphere, material, rod_of, sphe
 from iscat_analysis.optics.sized import sized
 from iscat_analysis.optics.waves import check_table, field_of
 from iscat_analysis.units import KILODALTON_KG, NM
-
-__all__ = [
-    "NEAR_CRITICAL",
-    "ForwardModel",
-    "MassScale",
-    "PixelGrid",
-    "check_table",
-    "forward_model",
-    "peak_per_amplitude",
-    "signed_peak",
-    "with_template",
-]
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

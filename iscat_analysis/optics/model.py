@@ -227,9 +227,9 @@ class ForwardModel:
 
         Shapes: result (ny, nx).
         """
-        out = np.empty(grid.shape)
+        model, out = self.at(amplitude), np.empty(grid.shape)
         theta = np.array([x_nm, y_nm, z_nm, amplitude])
-        signal_image(self.profile(z_nm, 1), *self._geometry(grid, theta), theta, out)
+        signal_image(model.profile(z_nm, 1), *model._geometry(grid, theta), theta, out)
         return out
 
     def gradient(
@@ -312,16 +312,17 @@ class ForwardModel:
         Shapes: result (1 or 2, *dx_nm.shape).
         """
         amplitude = self.scale.amplitude(mass_kda)
-        return amplitude * self.wave.components(dx_nm, dy_nm, z_nm)
+        return amplitude * self.at(mass_kda).wave.components(dx_nm, dy_nm, z_nm)
 
     def peak_contrast(self, z_nm: float, mass_kda: float) -> float:
         """Signal of largest magnitude over the plane, with its sign."""
         return self.amplitude_contrast(z_nm, self.scale.amplitude(mass_kda))
 
     def amplitude_contrast(self, z_nm: float, amplitude: float, height: str = "exact") -> float:
-        """Peak contrast of an amplitude; see `peak_contrast` and `amplitude_image`."""
-        if height == "exact" or isinstance(self.wave, MeasuredField):
-            return sum(self.wave.peak(z_nm, amplitude, self.rho))
+        """Peak contrast of an amplitude; a sphere of one mass has no table along z."""
+        model = self.at(amplitude)
+        if height == "exact" or model is not self or isinstance(self.wave, MeasuredField):
+            return sum(model.wave.peak(z_nm, amplitude, self.rho))
         table, orders = self.axial_table, 1 if isinstance(self.wave, RadialField) else 3
         profile = blank_profile(table, self.lens, orders)
         profile_at(table, z_nm, 0, table.heights.shape[3], profile)

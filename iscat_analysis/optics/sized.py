@@ -96,12 +96,6 @@ class SizedModel(ForwardModel):
         """Give the step of the mass with which differences are taken [kDa]."""
         return MASS_STEP * self.sphere.of_mass(amplitude).mass_kda
 
-    def amplitude_image(
-        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, amplitude: float
-    ) -> FloatArray:
-        """As `ForwardModel.amplitude_image`."""
-        return self.at(amplitude).amplitude_image(grid, x_nm, y_nm, z_nm, amplitude)
-
     def signal(
         self, grid: PixelGrid, values: Values, names: Sequence[str] = ()
     ) -> tuple[FloatArray, FloatArray]:
@@ -131,17 +125,6 @@ class SizedModel(ForwardModel):
             rows[:, _SECOND[k, 3]] = (above[:, 1 + k] - below[:, 1 + k]) / (2 * step)
         rows[:, _SECOND[3, 3]] = (above[:, 0] - 2 * rows[:, 0] + below[:, 0]) / step**2
         return rows
-
-    def field(
-        self, dx_nm: FloatArray, dy_nm: FloatArray, z_nm: float, mass_kda: float
-    ) -> ComplexArray:
-        """As `ForwardModel.field`."""
-        return self.at(mass_kda).field(dx_nm, dy_nm, z_nm, mass_kda)
-
-    def amplitude_contrast(self, z_nm: float, amplitude: float, height: str = "exact") -> float:
-        """As `ForwardModel.amplitude_contrast`; no mass has a table along z."""
-        del height
-        return self.at(amplitude).amplitude_contrast(z_nm, amplitude)
 
 
 def sized(model: ForwardModel, sphere: Sphere, diameters_nm: tuple[float, float]) -> SizedModel:

@@ -7,7 +7,7 @@ type in tables, its place in the schema, its line in the manual and its heading 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import pandas as pd
@@ -60,14 +60,12 @@ class Column:
         return self.values in ("status", "text", "end")
 
 
-def _of_each_parameter(
-    prefix: str, meaning: str, heading: str, *, optional: bool = False
-) -> tuple[Column, ...]:
+def _of_each_parameter(prefix: str, meaning: str, heading: str) -> tuple[Column, ...]:
     """Make a column for each parameter of a particle."""
     return tuple(
         Column(
             f"{prefix}_{name}", "number" if prefix in ("systematic", "repeat") else "positive",
-            meaning, heading, "kDa" if name == "mass_kda" else "nm", optional,
+            meaning, heading, "kDa" if name == "mass_kda" else "nm",
         )
         for name in PARAMETERS
     )  # fmt: skip
@@ -78,7 +76,7 @@ DIPOLE, NO_MODEL = "dipole", "none"
 
 _PIXEL = ", 0-based; an integer is a pixel's centre [px]"
 
-EVENTS = (
+EVENTS: tuple[Column, ...] = (
     Column("event", "count", "Number of the event"),
     Column("frame", "count", "First frame of the new state, or the fitted frame"),
     Column("n_before", "count", "Frames summed before"),
@@ -116,119 +114,94 @@ EVENTS = (
     Column("p_value", "share", "Probability of a worse fit if the model holds", "p"),
     Column("status", "status", "The verdict: the worst of the flags"),
     Column("flags", "text", "All flags, worst first, joined by semicolons"),
+)  # fmt: skip
+"""The columns of ``fits.csv``, in order; those that follow below are in some files."""
+
+EVENT_COLUMNS = tuple(column.name for column in EVENTS)
+"""Names of the columns that every ``fits.csv`` has, in order."""
+
+EVENTS += tuple(replace(column, optional=True) for column in (
     *_of_each_parameter(
         "systematic",
         "Error common to the movie, from calibrations of optics and mass; not part of σ [{}]",
-        "systematic", optional=True,
+        "systematic",
     ),
     Column(
         "systematic_contrast", "number",
         "Error of the contrast that is common to the movie; if there is no mass calibration",
-        optional=True,
     ),
     Column(
         "frame_ci95", "span",
-        "Half-width of the 95 % interval of frame [frames]; landing movies only", optional=True,
+        "Half-width of the 95 % interval of frame [frames]; landing movies only",
     ),
-    Column("track", "count", "Number of the track that the row belongs to", optional=True),
+    Column("track", "count", "Number of the track that the row belongs to"),
     Column(
         "tick", "count",
         "Intervals of the camera from the movie's first frame to frame; where the file's times "
-        "show that frames are missing", optional=True,
+        "show that frames are missing",
     ),
     *_of_each_parameter(
         "repeat",
         "Standard error from eight disjoint parts of the event's own frames, known to 19 %; in "
         "mode track, from the empty places of its frame [{}]",
-        "repeats", optional=True,
+        "repeats",
     ),
     Column(
         "model", "text",
         "What describes the image, in mode mass: dipole, a sphere of fit.spheres, or none",
-        optional=True,
     ),
     Column(
         "diameter_nm", "positive",
         "Diameter of the sphere; in mode size mass_kda is from it, in mode mass it is that of "
         "model, which stands on the coverslip [nm]", "diameter", "nm",
-        optional=True,
     ),
     Column(
         "sigma_diameter_nm", "positive", "Its standard deviation, as that of the mass [nm]", "σ",
-        optional=True,
     ),
-    Column(
-        "crb_diameter_nm", "positive", "Its joint Cramér–Rao bound [nm]", "CRB", optional=True
-    ),
-    Column(
-        "qcrb_diameter_nm", "positive", "Its quantum Cramér–Rao bound [nm]", "QCRB", optional=True
-    ),
+    Column("crb_diameter_nm", "positive", "Its joint Cramér–Rao bound [nm]", "CRB"),
+    Column("qcrb_diameter_nm", "positive", "Its quantum Cramér–Rao bound [nm]", "QCRB"),
     Column(
         "refractive_index", "positive",
         "Refractive index of the sphere, where it is fitted: model is sphere, or fit.index; empty "
-        "if the picture does not tell it", optional=True,
+        "if the picture does not tell it",
     ),
-    Column("sigma_refractive_index", "positive", "Its standard deviation", optional=True),
+    Column("sigma_refractive_index", "positive", "Its standard deviation"),
     Column(
         "systematic_diameter_nm", "not_negative",
         "Its error common to the movie, from inputs that were assumed [nm]", "systematic", "nm",
-        optional=True,
     ),
     Column(
         "other_diameter_nm", "positive",
         "Diameter of the next likely maximum of the likelihood, where there is another [nm]",
-        optional=True,
     ),
-    Column(
-        "other_odds", "share", "Likelihood of that diameter over that of diameter_nm",
-        optional=True,
-    ),
+    Column("other_odds", "share", "Likelihood of that diameter over that of diameter_nm"),
     Column(
         "diameter_probability", "share",
         "Posterior probability of diameter_nm among all diameters that were found, all in "
         "fit.diameter_range_nm being as likely before",
-        optional=True,
     ),
     Column(
         "pair_mass_kda", "number",
         "Mass of the particle if it is two equal halves; with fit.pairs [kDa]", "pair", "kDa",
-        optional=True,
     ),
     Column(
         "sigma_pair_mass_kda", "positive",
-        "Its standard deviation, which is its Cramér–Rao bound [kDa]", "σ", optional=True,
+        "Its standard deviation, which is its Cramér–Rao bound [kDa]", "σ",
     ),
-    Column(
-        "separation_nm", "not_negative", "Distance of the halves [nm]", "separation", "nm",
-        optional=True,
-    ),
+    Column("separation_nm", "not_negative", "Distance of the halves [nm]", "separation", "nm"),
     Column(
         "sigma_separation_nm", "positive",
-        "Its standard deviation, which is its Cramér–Rao bound [nm]", "σ", optional=True,
+        "Its standard deviation, which is its Cramér–Rao bound [nm]", "σ",
     ),
-    Column(
-        "angle_deg", "number", "Direction of the halves, from x towards y, 0 to 180 [°]",
-        optional=True,
-    ),
+    Column("angle_deg", "number", "Direction of the halves, from x towards y, 0 to 180 [°]"),
     Column(
         "sigma_angle_deg", "positive",
-        "Its standard deviation, which is its Cramér–Rao bound [°]", optional=True,
+        "Its standard deviation, which is its Cramér–Rao bound [°]",
     ),
-    Column(
-        "p_point", "share", "Probability that a point gains as much by a second half",
-        optional=True,
-    ),
-    Column(
-        "pair_chi2_reduced", "number", "Reduced χ² with two halves", optional=True,
-    ),
-    Column(
-        "pair_p_value", "share", "Probability of a worse fit if it is two halves", optional=True,
-    ),
-)  # fmt: skip
-"""The columns of ``fits.csv``, in order."""
-
-EVENT_COLUMNS = tuple(column.name for column in EVENTS if not column.optional)
-"""Names of the columns that every ``fits.csv`` has, in order."""
+    Column("p_point", "share", "Probability that a point gains as much by a second half"),
+    Column("pair_chi2_reduced", "number", "Reduced χ² with two halves"),
+    Column("pair_p_value", "share", "Probability of a worse fit if it is two halves"),
+))  # fmt: skip
 
 FRAME_COLUMN = "frame_ci95"
 """Column of ``fits.csv`` after `EVENT_COLUMNS`, of landing movies: half-width of the 95 % interval
@@ -238,7 +211,7 @@ REPEAT_COLUMNS = tuple(f"repeat_{name}" for name in PARAMETERS)
 """Columns of ``fits.csv``: standard errors of an event from disjoint parts of its own frames; of a
 single frame, from the empty places of that frame."""
 
-TRACKS = (
+TRACKS: tuple[Column, ...] = (
     Column("track", "count", "Number of the track, as in fits.csv"),
     Column("first_frame", "count", "First frame with the particle"),
     Column("last_frame", "count", "Last frame with it"),
@@ -314,33 +287,33 @@ TRACKS = (
            "movie: in the first frame; border: within a step of the field's border; inside: "
            "elsewhere"),
     Column("ends", "end", "The same for the last frame"),
+)  # fmt: skip
+"""The columns of ``tracks.csv``, in order; those that follow below are in some files."""
+
+TRACK_COLUMNS = tuple(column.name for column in TRACKS)
+"""Names of the columns that every ``tracks.csv`` has, in order."""
+
+TRACKS += tuple(replace(column, optional=True) for column in (
     Column("systematic_mass_kda", "number", "Error common to the movie, from calibrations [kDa]",
-           "systematic [kDa]", optional=True),
+           "systematic [kDa]"),
     Column(
         "optical_diameter_nm", "positive",
         "Diameter of the sphere that the images of all frames show; of spheres, which have "
-        "mass_kda from it [nm]", "optical diameter [nm]", optional=True,
+        "mass_kda from it [nm]", "optical diameter [nm]",
     ),
-    Column("sigma_optical_diameter_nm", "positive", "Its standard error [nm]", "σ [nm]",
-           optional=True),
-    Column("crb_optical_diameter_nm", "positive", "Its Cramér–Rao bound [nm]", "CRB [nm]",
-           optional=True),
+    Column("sigma_optical_diameter_nm", "positive", "Its standard error [nm]", "σ [nm]"),
+    Column("crb_optical_diameter_nm", "positive", "Its Cramér–Rao bound [nm]", "CRB [nm]"),
     Column(
         "optical_probability", "share",
         "Posterior probability of that diameter among all that the images allow",
-        optional=True,
     ),
     Column(
         "log_odds_particle", "number",
         "Logarithm of the posterior odds, from images and diffusion, that the track is of "
         "[particle] with any diameter, against a homogeneous sphere of any diameter and any index "
-        "up to 1.8", "ln odds", optional=True,
+        "up to 1.8", "ln odds",
     ),
-)  # fmt: skip
-"""The columns of ``tracks.csv``, in order."""
-
-TRACK_COLUMNS = tuple(column.name for column in TRACKS if not column.optional)
-"""Names of the columns that every ``tracks.csv`` has, in order."""
+))  # fmt: skip
 
 
 BUDGET_COLUMNS = ("name", "kind", "common", "sigma_mass_kda", "sigma_rel", "dof", "remedy")

@@ -99,7 +99,7 @@ def test_an_analysis_loads_nothing_that_it_does_not_need(loaded) -> None:
 def test_every_public_name_is_there_and_documented() -> None:
     source = ast.parse(Path(ia.__file__).read_text(encoding="utf-8"))
     typed = [node.names[0].name for node in ast.walk(source) if isinstance(node, ast.ImportFrom)]
-    assert {*typed} - {"annotations", "import_module", "TYPE_CHECKING"} == {*ia.__all__}
+    assert {*typed} - {"annotations", "import_module", "Path", "TYPE_CHECKING"} == {*ia.__all__}
     assert set(ia.__all__) <= set(dir(ia))
     for name in ia.__all__:
         assert getattr(ia, name).__doc__
