@@ -22,7 +22,7 @@ from iscat_analysis.findings import Finding, existing
 from iscat_analysis.findings import tables as said
 from iscat_analysis.inference.checks import LARGEST, choice_in, number_in, path_in, truth_in
 from iscat_analysis.movie import path_beside, split_address
-from iscat_analysis.movie.text_tables import read_frame, refuse_twice
+from iscat_analysis.movie.tables import read_frame, refuse_twice
 from iscat_analysis.options import BindingOptions, EventOptions, only, takes
 from iscat_analysis.reading import is_file, is_folder, read_json
 from iscat_analysis.records import BoolArray, FloatArray

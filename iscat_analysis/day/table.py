@@ -31,7 +31,7 @@ from iscat_analysis.movie import (
     path_beside,
     split_address,
 )
-from iscat_analysis.movie.text_tables import read_table_text, table_lines
+from iscat_analysis.movie.tables import read_table_text, table_lines
 from iscat_analysis.reading import is_file, is_folder, read_text, toml_of
 from iscat_analysis.text import printable
 

@@ -39,7 +39,7 @@ from iscat_analysis.movie.stack import (
     not_shared,
     single_frame,
 )
-from iscat_analysis.movie.text_tables import read_frame, refuse_twice
+from iscat_analysis.movie.tables import read_frame, refuse_twice
 from iscat_analysis.movie.tiff import holds_single_frames, open_tiff
 from iscat_analysis.records import StackMetadata
 

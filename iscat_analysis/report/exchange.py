@@ -16,7 +16,7 @@ import pandas as pd
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
 from iscat_analysis.inference.checks import truth_in
-from iscat_analysis.movie.text_tables import refuse_twice
+from iscat_analysis.movie import refuse_twice
 from iscat_analysis.reading import first_line, is_file, open_regular, read_json
 from iscat_analysis.records import EVENT_COLUMNS, FloatArray, Status, is_event, track_numbers
 from iscat_analysis.report.tables import write_csv

@@ -39,7 +39,7 @@ from iscat_analysis.findings.tables import (
     UNKNOWN_LIMIT,
 )
 from iscat_analysis.inference.checks import number_in
-from iscat_analysis.movie.event_tables import named, read_events, unit_note
+from iscat_analysis.movie.tables import named, read_events, unit_note
 from iscat_analysis.options import EventOptions, only, takes
 from iscat_analysis.reading import read_json
 from iscat_analysis.records import FloatArray, species_rows

@@ -16,7 +16,7 @@ from iscat_analysis.bounds.experiment import height_of, reach_of
 from iscat_analysis.config import Config, configure
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import choice_in, number_in
-from iscat_analysis.movie.text_tables import refuse_twice
+from iscat_analysis.movie.tables import refuse_twice
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
 from iscat_analysis.study.setting import OF_DIPOLES

@@ -26,7 +26,7 @@ from iscat_analysis.calibration import (
 from iscat_analysis.calibration import fit as peaks
 from iscat_analysis.config import configure, parse_config
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.movie.event_tables import read_events
+from iscat_analysis.movie.tables import read_events
 from iscat_analysis.species import Searched, describe
 from iscat_analysis.species.tables import event_table
 

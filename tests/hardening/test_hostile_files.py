@@ -21,7 +21,7 @@ from tiff_files import ASCII, LONG, SHORT, movie, pages_of, write_tiff
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.event_tables import read_events
+from iscat_analysis.movie.tables import read_events
 
 CAP = 256_000_000  # bytes that refusing a file may allocate
 ROOT = Path(__file__).resolve().parents[2]

@@ -27,7 +27,7 @@ from iscat_analysis.answers.calibrations import read_contrasts
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import hdf5 as refeyn_module
 from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.event_tables import TABLE_COLUMNS, read_events
+from iscat_analysis.movie.tables import TABLE_COLUMNS, read_events
 
 ENCODED = {"differences": True, "encoding": "TIME_DIFFERENCE"}
 

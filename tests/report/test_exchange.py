@@ -18,7 +18,7 @@ from walkers import EXPOSURE_MS, PIXEL_NM, RATE_HZ, SETUP, fits_of, walk
 from iscat_analysis import to_napari, to_photomol, to_picasso, to_trackpy
 from iscat_analysis.answers.calibrations import mass_calibration
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.movie.event_tables import TABLE_COLUMNS, read_events
+from iscat_analysis.movie.tables import TABLE_COLUMNS, read_events
 from iscat_analysis.report.exchange import export_result
 from iscat_analysis.species import describe_tracks
 from iscat_analysis.species.tables import event_table

@@ -9,8 +9,7 @@ import pandas as pd
 import pytest
 
 import iscat_analysis as ia
-from iscat_analysis.movie.event_tables import read_events
-from iscat_analysis.movie.text_tables import read_frame
+from iscat_analysis.movie.tables import read_events, read_frame
 from iscat_analysis.species.tables import event_table
 from iscat_cli import main
 
