@@ -22,7 +22,7 @@ import iscat_analysis as ia
 from iscat_analysis._kernels.radial import profile_at
 from iscat_analysis._kernels.scoring import blank_profile, picture_at, score_pass, span, value_pass
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.optics.stamp import sample_picture
+from iscat_analysis.optics.pixels import sample_picture
 
 PIXEL_NM, HEIGHTS, TAPS = 84.4, 51, 8
 

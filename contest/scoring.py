@@ -24,8 +24,7 @@ from iscat_analysis.bounds import paper
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.executors import versions
-from iscat_analysis.files import whole_file
-from iscat_analysis.hashing import sha256_of_files
+from iscat_analysis.files import sha256_of_files, whole_file
 from iscat_analysis.movie import open_stack
 from iscat_analysis.reading import is_folder
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Progress, silent

@@ -3,7 +3,7 @@
 At one height the signal is a P(x, y) + a² Q(x, y), both averaged over a pixel and band-limited,
 P at k·NA and Q at twice that.  With `fine` samples of P and Q per pixel, an image needs no pupil,
 no fields and no samples inside the pixels.  The samples lie on the grid of the pixels, so that all
-pixels of an image have the same `TAPS`² weights, those of `iscat_analysis.optics.stamp`.  They are
+pixels of an image have the same `TAPS`² weights, those of `iscat_analysis.optics.pixels`.  They are
 applied along y first and then along x, with the derivatives of the weights for those of the image:
 s = a S with S = P + a Q, ∂s/∂a = D = P + 2a Q, ∂²s/∂a² = 2Q = 2 (D − S)/a.
 

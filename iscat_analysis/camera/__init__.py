@@ -11,14 +11,19 @@ from iscat_analysis.camera.background import (
     smooth_background,
     start_power,
 )
-from iscat_analysis.camera.calibration import measure_camera
+from iscat_analysis.camera.calibration import CameraCalibration, Estimate, measure_camera
 from iscat_analysis.camera.counts import (
+    LARGEST_PX,
     Camera,
+    CutFrames,
+    FieldSample,
     camera_from_config,
     check_counts,
     read_map,
     refuse_overflow,
     refuse_ratio,
+    sampled,
+    whole_frames,
 )
 from iscat_analysis.camera.drift import (
     ComplexArray,
@@ -34,20 +39,12 @@ from iscat_analysis.camera.drift import (
     still_light,
     trusted,
 )
-from iscat_analysis.camera.field_sample import (
-    LARGEST_PX,
-    CutFrames,
-    FieldSample,
-    sampled,
-    whole_frames,
-)
 from iscat_analysis.camera.gain import (
     GainDiagnosis,
     diagnose_gain,
     shared_light,
     without_pattern_jitter,
 )
-from iscat_analysis.camera.laws import Law, Response
 from iscat_analysis.camera.learned import (
     ASSUMPTION,
     MEASURED,
@@ -56,8 +53,13 @@ from iscat_analysis.camera.learned import (
     resolve_metadata,
     with_camera,
 )
-from iscat_analysis.camera.light import LightModel, PartOfLight, SteadyFrames, with_lines
-from iscat_analysis.camera.light_search import find_light
+from iscat_analysis.camera.light import (
+    LightModel,
+    PartOfLight,
+    SteadyFrames,
+    find_light,
+    with_lines,
+)
 from iscat_analysis.camera.pixels import (
     find_unsteady,
     text_finding,
@@ -65,7 +67,10 @@ from iscat_analysis.camera.pixels import (
     unsteady_finding,
     without_text,
 )
-from iscat_analysis.camera.processed import Processing, find_processing
-from iscat_analysis.camera.regression import CameraCalibration, Estimate
-from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
-from iscat_analysis.camera.transfer import SIGMAS, TOLERANCE, LightZero, find_zero
+from iscat_analysis.camera.spectrum import (
+    NoiseSpectrum,
+    Processing,
+    find_processing,
+    measure_spectrum,
+)
+from iscat_analysis.camera.transfer import SIGMAS, TOLERANCE, Law, LightZero, Response, find_zero

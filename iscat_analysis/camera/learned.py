@@ -29,10 +29,20 @@ from iscat_analysis.camera.counts import (
     rounding_variance_adu2,
 )
 from iscat_analysis.camera.gain import averaged_noise, diagnose_gain, without_pattern_jitter
-from iscat_analysis.camera.laws import Law, Response, find_law, full_scale, linear, response_of
 from iscat_analysis.camera.pixels import find_text, without_text
 from iscat_analysis.camera.spectrum import measure_spectrum
-from iscat_analysis.camera.transfer import TOLD, Transfer, judge_zero, measure_transfer
+from iscat_analysis.camera.transfer import (
+    TOLD,
+    Law,
+    Response,
+    Transfer,
+    find_law,
+    full_scale,
+    judge_zero,
+    linear,
+    measure_transfer,
+    response_of,
+)
 from iscat_analysis.config import ASSUMED, AUTO, CameraConfig, Config, Optics, plausible_pixel
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.findings import Finding, existing

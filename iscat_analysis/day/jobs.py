@@ -27,8 +27,7 @@ from iscat_analysis.answers.output import Notify, tell
 from iscat_analysis.config import Config, config_to_toml, with_absolute_paths
 from iscat_analysis.errors import DataError, IscatError, SchedulerError
 from iscat_analysis.executors import Executor
-from iscat_analysis.files import take, whole_file
-from iscat_analysis.hashing import fingerprint, sha256_of_files
+from iscat_analysis.files import fingerprint, sha256_of_files, take, whole_file
 from iscat_analysis.movie import files_of, not_shared, open_stack, split_address
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.records import Progress, silent

@@ -33,8 +33,8 @@ from iscat_analysis.day import Batch, batch, checked_options
 from iscat_analysis.day.jobs import Records, claim_folder
 from iscat_analysis.day.table import TABLES, Table, read_growing
 from iscat_analysis.errors import ConfigError, DataError, IscatError, SchedulerError
+from iscat_analysis.files import states_of
 from iscat_analysis.fitting.run import is_resumable
-from iscat_analysis.hashing import states_of
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie import Stack, files_of, find_movies, is_open_to_write, open_stack
 from iscat_analysis.options import DayOptions, takes

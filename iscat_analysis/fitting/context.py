@@ -21,8 +21,8 @@ from iscat_analysis.optics.local import (
     refuse_uneven_field,
     terms_of,
 )
+from iscat_analysis.optics.pixels import margin_nm
 from iscat_analysis.optics.sized import SeatedModel, seated_models
-from iscat_analysis.optics.stamp import margin_nm
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray
 from iscat_analysis.search.frames import Tile
 from iscat_analysis.search.sliding import CORRELATION

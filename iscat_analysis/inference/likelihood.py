@@ -41,8 +41,7 @@ from iscat_analysis.inference.laws import NOISE_LAWS, NoiseLaw
 from iscat_analysis.inference.maximiser import PASSES, TOLERANCE, Optimum, maximise
 from iscat_analysis.inference.models import ParticleModel
 from iscat_analysis.optics.model import ForwardModel, Parameter
-from iscat_analysis.optics.pixels import PixelGrid
-from iscat_analysis.optics.stamp import margin_nm
+from iscat_analysis.optics.pixels import PixelGrid, margin_nm
 from iscat_analysis.records import BoolArray, Box, FloatArray
 
 LEVEL = 4

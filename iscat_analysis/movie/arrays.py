@@ -44,6 +44,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK, Layout, layout
 from iscat_analysis.movie.mapped import (
     WHAT_LIBRARIES_RAISE,
+    Scratch,
     damaged,
     frames_in_place,
     map_file,
@@ -55,7 +56,6 @@ from iscat_analysis.movie.mapped import (
 from iscat_analysis.movie.stack import ArrayFrames, FileSet, Frames, shape_of_frames, single_frame
 from iscat_analysis.reading import is_file, open_regular, read_text
 from iscat_analysis.records import InPlace, StackMetadata
-from iscat_analysis.scratch import Scratch
 from iscat_analysis.units import listed
 
 _LEAST_PIXELS = 1024  # of a frame that tell an order

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple, NoReturn
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.hashing import refuse_changed, states_of
+from iscat_analysis.files import refuse_changed, states_of
 from iscat_analysis.movie.addresses import MARK, split_address
 from iscat_analysis.movie.arrays import (
     NPY_SIGNATURE,

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.hashing import fingerprint, refuse_changed, sha256_of_files, states_of
+from iscat_analysis.files import fingerprint, refuse_changed, sha256_of_files, states_of
 from iscat_analysis.last_used import memoize
 from iscat_analysis.movie.addresses import MARK, split_address
 from iscat_analysis.records import (

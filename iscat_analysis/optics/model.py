@@ -45,10 +45,9 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.last_used import kept
 from iscat_analysis.optics.aperture import Aperture
 from iscat_analysis.optics.measured import MeasuredField
-from iscat_analysis.optics.pixels import PixelArea, PixelGrid
+from iscat_analysis.optics.pixels import PixelArea, PixelGrid, sample_picture
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.optics.scatterers import Material
-from iscat_analysis.optics.stamp import sample_picture
 from iscat_analysis.optics.waves import (
     Field,
     LatticeField,

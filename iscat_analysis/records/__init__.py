@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from iscat_analysis.config import PARAMETERS
-from iscat_analysis.records.analysis import Analysis, Clip, EventView, Film, Provenance, Trace
 from iscat_analysis.records.columns import (
     BUDGET_COLUMNS,
     DIPOLE,
@@ -36,10 +35,14 @@ from iscat_analysis.records.steps import (
     NO_EVENT,
     SEVERITY,
     Alternative,
+    Analysis,
     BoolArray,
     Box,
     Candidate,
+    Clip,
     CountSource,
+    EventView,
+    Film,
     FitResult,
     FloatArray,
     FrameSource,
@@ -49,8 +52,10 @@ from iscat_analysis.records.steps import (
     PlacedSource,
     PosteriorResult,
     Progress,
+    Provenance,
     StackMetadata,
     Status,
+    Trace,
     TrackStatus,
     Windows,
     silent,

@@ -17,8 +17,8 @@ from iscat_analysis._kernels.sliding import block_sums
 from iscat_analysis.camera import Camera, check_counts, sampled
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.movie.mapped import Scratch
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, Mapper
-from iscat_analysis.scratch import Scratch
 from iscat_analysis.search.frames import (
     DARK,
     EVERYWHERE,

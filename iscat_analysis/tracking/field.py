@@ -50,7 +50,7 @@ from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.laws import POISSON
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.optics.model import blurred, spreads
-from iscat_analysis.optics.stamp import BAND, RINGS, sample_picture, weights_between
+from iscat_analysis.optics.pixels import BAND, RINGS, sample_picture, weights_between
 from iscat_analysis.optics.waves import axial_table
 from iscat_analysis.records import BoolArray, FloatArray, IntArray, Mapper
 from iscat_analysis.tracking.rows import BackgroundEstimate, Judged, Localizations, Response

@@ -14,9 +14,8 @@ from recorded_light import LEVEL_E, SHAPE, gamma, linear, record, saturation
 
 import iscat_analysis as ia
 from iscat_analysis.camera import Camera, Law, LearnedCamera
-from iscat_analysis.camera.laws import find_law, read_response
 from iscat_analysis.camera.learned import learn_camera
-from iscat_analysis.camera.transfer import measure_transfer
+from iscat_analysis.camera.transfer import find_law, measure_transfer, read_response
 from iscat_analysis.config import CameraConfig
 from iscat_analysis.diagnosis.noise import law_finding
 from iscat_analysis.movie import open_stack

@@ -10,8 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 import iscat_analysis as ia
 from iscat_analysis.camera import Camera
-from iscat_analysis.camera.laws import find_law
-from iscat_analysis.camera.transfer import measure_transfer
+from iscat_analysis.camera.transfer import find_law, measure_transfer
 from iscat_analysis.config import Config
 from iscat_analysis.fitting import events
 from iscat_analysis.landing import measured_images

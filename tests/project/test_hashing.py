@@ -11,7 +11,7 @@ import tifffile
 
 import iscat_analysis as ia
 from iscat_analysis.errors import DataError
-from iscat_analysis.hashing import sha256_of_files
+from iscat_analysis.files import sha256_of_files
 from iscat_analysis.movie import formats
 
 

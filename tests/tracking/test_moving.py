@@ -26,7 +26,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.inference.counts import poisson
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.optics.model import blurred, path_variance_nm2
-from iscat_analysis.optics.stamp import BAND, RINGS, sample_picture
+from iscat_analysis.optics.pixels import BAND, RINGS, sample_picture
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.records import Box
 from iscat_analysis.species import fit_diffusion
