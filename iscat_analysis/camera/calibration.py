@@ -46,8 +46,8 @@ from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.errors import DataError
 from iscat_analysis.medians import robust_sigma
 from iscat_analysis.movie import SelectedFrames
-from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress, silent
-from iscat_analysis.units import listed
+from iscat_analysis.records import BoolArray, CountSource, FloatArray, FrameSource, Progress, silent
+from iscat_analysis.units import are, frames_listed
 
 _TOGETHER = {"frames": (1, 2), "rows": (2,), "columns": (1,)}  # axes of (t, y, x)
 
@@ -226,12 +226,11 @@ def mask_notes(masked: Mapping[str, BoolArray]) -> list[str]:
     """
     notes = []
     for name, mask in masked.items():
-        count = int(mask.sum())
-        if count:
-            place = np.argwhere(mask)[0]
+        if mask.any():
+            (y, x), number = np.argwhere(mask)[0], int(mask.sum())
             notes.append(
-                f"{count} of {mask.size} pixels {'is' if count == 1 else 'are'} {name} and left "
-                f"out, the first at y = {place[0]}, x = {place[1]}"
+                f"{number} of {mask.size} pixels {are(number)} {name} and left out, the first at "
+                f"y = {y}, x = {x}"
             )
     return notes
 
@@ -739,9 +738,9 @@ _CURVE_COLUMNS = ["mean_adu", "variance_adu2", "variance_se", "fit_adu2", "pixel
 
 
 def measure_camera(
-    light: Sequence[FrameSource],
+    light: Sequence[CountSource],
     *,
-    dark: FrameSource | None = None,
+    dark: CountSource | None = None,
     offset_adu: float | None = None,
     maps: bool = False,
     progress: Progress = silent,
@@ -1009,7 +1008,7 @@ def _from_dark(dark: Moments, masked: dict[str, BoolArray], maps: bool) -> Camer
     )
 
 
-def without_repeats(stack: FrameSource, least: int, notes: list[str]) -> FrameSource:
+def without_repeats(stack: CountSource, least: int, notes: list[str]) -> CountSource:
     """Leave out frames that are zero throughout or equal to the frame before."""
     total = stack.shape[0]
     good = np.zeros(total, dtype=np.bool_)
@@ -1028,8 +1027,7 @@ def without_repeats(stack: FrameSource, least: int, notes: list[str]) -> FrameSo
         )
     lost = np.flatnonzero(~good)
     notes.append(
-        f"{stack.name}: frame{'s' if lost.size > 1 else ''} {listed(lost, 4)} "
-        f"{'are' if lost.size > 1 else 'is'} zero throughout or the same as the frame before "
-        "(dropped or stuck in the camera); left out"
+        f"{stack.name}: {frames_listed(lost)} {are(lost.size)} zero throughout or the same as the "
+        "frame before (dropped or stuck in the camera); left out"
     )
     return SelectedFrames(stack, kept)

@@ -25,9 +25,10 @@ from numpy.typing import DTypeLike, NDArray
 
 from iscat_analysis.config import ASSUMED, CameraConfig
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie import WHAT_LIBRARIES_RAISE, bytes_are_swapped
+from iscat_analysis.movie import WHAT_LIBRARIES_RAISE, ChangedFrames, bytes_are_swapped
 from iscat_analysis.reading import is_file
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, PlacedSource
+from iscat_analysis.units import count
 
 if TYPE_CHECKING:
     from iscat_analysis.camera.transfer import Law
@@ -236,8 +237,8 @@ def read_map(path: Path, key: str, shape_yx: tuple[int, int]) -> FloatArray:
 def _first(bad: BoolArray) -> str:
     """Say how many pixels are bad, and where the first one is."""
     y, x = np.unravel_index(int(np.argmax(bad)), bad.shape)
-    count = int(np.count_nonzero(bad))
-    return f"in {count} {'pixel' if count == 1 else 'pixels'}, the first at y = {y}, x = {x}"
+    number = count(int(np.count_nonzero(bad)), "pixel")
+    return f"in {number}, the first at y = {y}, x = {x}"
 
 
 def check_counts(
@@ -472,32 +473,31 @@ class FieldSample:
         }
 
 
-class CutFrames:
+@dataclass(frozen=True, eq=False)
+class CutFrames(ChangedFrames):
     """Frames of a movie, of which only some of the pixels are kept.
 
     Where frames lie in the file as they are, the others are not read.
     """
 
-    def __init__(
-        self,
-        movie: CountSource,
-        shape: tuple[int, int],
-        cut: Callable[[NDArray[Any]], NDArray[Any]],
-    ) -> None:
-        self._movie, self._cut = movie, cut
-        self.shape = (movie.shape[0], *shape)
-        self.name, self.dtype = movie.name, movie.dtype
+    size: tuple[int, int]
+    cut: Callable[[NDArray[Any]], NDArray[Any]]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows, columns."""
+        return self.source.shape[0], *self.size
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames.
 
         Shapes: result (stop − start, y, x).
         """
-        movie = self._movie
+        movie = self.source
         placed = movie.in_place(start, stop) if isinstance(movie, PlacedSource) else None
         if placed is not None:
             placed.check()
-            out = np.array(self._cut(placed.counts))
+            out = np.array(self.cut(placed.counts))
             placed.let_go()
             return out
         # some megabytes of whole frames are read at a time
@@ -505,7 +505,7 @@ class CutFrames:
         out = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
         for first in range(start, stop, step):
             end = min(first + step, stop)
-            out[first - start : end - start] = self._cut(movie.read(first, end))
+            out[first - start : end - start] = self.cut(movie.read(first, end))
         return out
 
 

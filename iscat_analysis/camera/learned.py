@@ -250,8 +250,8 @@ def learn_camera(
     if dark is not None:
         found.take_dark(dark)
     found.learn()
-    numbers = {key: found.number(key) for key in ASSUMED}
     as_before = (ASSUMPTION, CONFIGURED)
+    numbers = found.numbers
     changed = {key: each.value for key, each in numbers.items() if each.source not in as_before}
     return LearnedCamera(
         config=config.assumed.model_copy(update=changed),
@@ -278,19 +278,18 @@ class _Learning:
         self.transfer: Transfer | None = None
         self.findings: list[Finding] = []
         self.level_e, self.refusal = 0.0, ""
-        self._se = dict.fromkeys(ASSUMED, 0.0)
-        self._source = {key: ASSUMPTION if key in free else CONFIGURED for key in ASSUMED}
+        sources = {key: ASSUMPTION if key in free else CONFIGURED for key in ASSUMED}
+        self.numbers = {
+            key: Number(float(np.mean(getattr(camera, key))), 0.0, source)
+            for key, source in sources.items()
+        }
+        """Of maps, their means."""
         self._dark_variance: float | None = None
 
     @property
     def gain(self) -> float:
         """Photoelectrons per count, on average."""
-        return float(np.mean(self.camera.gain_e_per_adu))
-
-    def number(self, key: str) -> Number:
-        """Value of a number; of a map, its mean."""
-        value = float(np.mean(getattr(self.camera, key)))
-        return Number(value, self._se[key], self._source[key])
+        return self.numbers["gain_e_per_adu"].value
 
     def response(self) -> Response | None:
         """Make the response curve where the counts follow a known law that is not linear."""
@@ -337,11 +336,15 @@ class _Learning:
 
     def _set(self, key: str, value: float, se: float, source: str) -> None:
         self.camera = replace(self.camera, **{key: value})  # type: ignore[arg-type]
-        self._se[key], self._source[key] = se, source
+        self.numbers[key] = Number(value, se, source)
+
+    def _uncertain(self, se: float) -> None:
+        """Set the error of an offset that is assumed."""
+        self.numbers["offset_adu"] = replace(self.numbers["offset_adu"], se=se)
 
     def _cannot(self, why: str) -> None:
         """Say once that the gain keeps its default."""
-        if self._source["gain_e_per_adu"] == ASSUMPTION:
+        if self.numbers["gain_e_per_adu"].source == ASSUMPTION:
             self.findings.append(GAIN_ASSUMED({"why": why, "gain": ASSUMED["gain_e_per_adu"]}))
 
     def _learn_gain(self) -> bool:
@@ -411,8 +414,8 @@ class _Learning:
             return
         self.level_e = found.level
         level_adu = found.level / self.gain
-        dark = self._source["offset_adu"] in (DARK, METADATA)
-        lowest = -float(np.mean(self.camera.offset_adu)) / level_adu
+        dark = self.numbers["offset_adu"].source in (DARK, METADATA)
+        lowest = -self.numbers["offset_adu"].value / level_adu
         most_read = self._most_read_e2 / found.level
         self.law = law = find_law(found, most_read=most_read, least_offset=lowest)
         if dark:
@@ -421,11 +424,11 @@ class _Learning:
             if law.kind == "offset" and abs(law.value) > 4 * law.se:
                 self._take_offset(law, level_adu)
             elif law.kind == "linear":
-                self._se["offset_adu"] = law.se * level_adu  # of the assumption
+                self._uncertain(law.se * level_adu)  # of the assumption
         if law.kind == "read noise" and "read_noise_e" in self.free:
             share, level = law.value, found.level
             if "gain_e_per_adu" in self.free:
-                gain, se = self.gain * (1 + share), self._se["gain_e_per_adu"]
+                gain, se = self.gain * (1 + share), self.numbers["gain_e_per_adu"].se
                 self._set("gain_e_per_adu", gain, se, MEASURED)
                 level *= 1 + share
             read = math.sqrt(share * level)
@@ -434,7 +437,7 @@ class _Learning:
 
     def _take_offset(self, law: Law, level_adu: float) -> None:
         """Take the offset from the zero of the light, and measure the rest again."""
-        offset = float(np.mean(self.camera.offset_adu)) + law.value * level_adu
+        offset = self.numbers["offset_adu"].value + law.value * level_adu
         error = law.se * level_adu
         self._set("offset_adu", offset, error, MEASURED)
         self.free.discard("offset_adu")
@@ -451,8 +454,8 @@ class _Learning:
 
     def _mind_zero(self) -> None:
         """Refuse counts without a true zero, where neither offset nor gain is known otherwise."""
-        measured = self._source["gain_e_per_adu"] in (MEASURED, EFFECTIVE)
-        if self._source["offset_adu"] != ASSUMPTION or not measured:
+        measured = self.numbers["gain_e_per_adu"].source in (MEASURED, EFFECTIVE)
+        if self.numbers["offset_adu"].source != ASSUMPTION or not measured:
             return
         law = self.law
         if law is not None and law.below_nothing:
@@ -480,14 +483,16 @@ class _Learning:
         elif zero is not None and zero.error is not None:
             told = law.se if law is not None else math.inf
             self.level_e = zero.level_e
-            self._se["offset_adu"] = min(told, zero.error) * zero.level_e / self.gain
+            self._uncertain(min(told, zero.error) * zero.level_e / self.gain)
 
     def _mind_rounding(self) -> None:
         """Count rounding as read noise, unless it is far below the noise of the light."""
         rounding = rounding_variance_adu2(self.counts) * self.gain**2 - 1 / 12
         light = float(np.median(self.camera.to_electrons(self.counts.mean(axis=0))))
         read = float(np.mean(np.square(self.camera.read_noise_e)))
-        if self._source["gain_e_per_adu"] != EFFECTIVE and rounding > max(read, 1e-3 * light):
+        if self.numbers["gain_e_per_adu"].source != EFFECTIVE and rounding > max(
+            read, 1e-3 * light
+        ):
             self._set("read_noise_e", math.sqrt(rounding), 0.0, ROUNDING)
 
 

@@ -27,7 +27,7 @@ from iscat_analysis.findings import Finding
 from iscat_analysis.findings.camera import FRAMES_DARK, REPEATS_LEFT_OUT
 from iscat_analysis.fitting.ranges import frame_ranges
 from iscat_analysis.fitting.results import DetectionResult
-from iscat_analysis.movie import ChangedFrames, Stack, StackFrames
+from iscat_analysis.movie import ChangedFrames, SelectedFrames, Stack
 from iscat_analysis.records import BoolArray, Windows
 from iscat_analysis.search.frames import DARK, cut_off, measure_frames, well_lit
 from iscat_analysis.units import are, frames_listed
@@ -175,7 +175,7 @@ def without_repeats(movie: Stack, config: Config, camera: Camera) -> KeptFrames:
     words = {"repeat": "repeats" if missing.size == 1 else "repeat", "are": are(missing.size)}
     words["frames"] = frames_listed(missing)
     finding = REPEATS_LEFT_OUT({**words, "of": used.size}, where=movie.name)
-    return KeptFrames(movie.seen_as(StackFrames(movie, numbers)), own, config, numbers, finding)
+    return KeptFrames(movie.seen_as(SelectedFrames(movie, numbers)), own, config, numbers, finding)
 
 
 def _repeats(movie: Stack, camera: Camera, span: tuple[int, int]) -> BoolArray:

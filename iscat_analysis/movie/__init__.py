@@ -35,7 +35,6 @@ from iscat_analysis.movie.stack import (
     Frames,
     SelectedFrames,
     Stack,
-    StackFrames,
     not_shared,
     single_frame,
 )

@@ -21,7 +21,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar, runtime_checkable
+from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +30,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.files import fingerprint, refuse_changed, sha256_of_files, states_of
 from iscat_analysis.last_used import memoize
 from iscat_analysis.movie.addresses import MARK, split_address
-from iscat_analysis.records import (
-    BoolArray,
-    CountSource,
-    FrameSource,
-    InPlace,
-    PlacedSource,
-    StackMetadata,
-)
+from iscat_analysis.records import BoolArray, CountSource, InPlace, PlacedSource, StackMetadata
 from iscat_analysis.text import printable
 from iscat_analysis.threads import start_in_thread
 
@@ -509,9 +502,6 @@ class Stack:
             )
 
 
-S = TypeVar("S", bound=FrameSource)
-
-
 @dataclass(frozen=True, eq=False)
 class ChangedFrames:
     """Wrapper around the frames of a movie, whose subclass overrides `read`."""
@@ -541,16 +531,10 @@ class ChangedFrames:
 
 
 @dataclass(frozen=True, eq=False)
-class SelectedFrames(Generic[S]):
-    """Some frames of a stack."""
+class SelectedFrames(ChangedFrames):
+    """Some frames of a movie."""
 
-    source: S
     frames: NDArray[np.int64]
-
-    @property
-    def name(self) -> str:
-        """What messages call it."""
-        return self.source.name
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -566,10 +550,6 @@ class SelectedFrames(Generic[S]):
         runs = np.split(wanted, np.flatnonzero(np.diff(wanted) > 1) + 1)
         parts = [self.source.read(int(run[0]), int(run[-1]) + 1) for run in runs if run.size]
         return np.concatenate(parts) if parts else self.source.read(0, 0)
-
-
-class StackFrames(SelectedFrames[Stack], ChangedFrames):
-    """Some frames of a movie, which another one can be made of."""
 
 
 class FileSet:

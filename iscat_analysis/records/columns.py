@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import pandas as pd
 
@@ -25,6 +25,10 @@ def free_parameters(mode: str, fits: pd.DataFrame) -> tuple[str, ...]:
     return fitted if MODES[mode].follows_tracks and fitted else names
 
 
+_Words = Literal["status", "text", "end"]
+_Numbers = Literal["count", "natural", "number", "positive", "not_negative", "share", "span"]
+
+
 @dataclass(frozen=True)
 class Column:
     """One column: its values, what they mean, and whether every table has it.
@@ -34,10 +38,7 @@ class Column:
     """
 
     name: str
-    values: Literal[
-        "count", "natural", "number", "positive", "not_negative", "share", "span", "status",
-        "text", "end",
-    ]  # fmt: skip
+    values: _Numbers | _Words
     meaning: str
     heading: str = ""
     unit: str = ""
@@ -57,18 +58,21 @@ class Column:
     @property
     def is_text(self) -> bool:
         """Whether it holds words."""
-        return self.values in ("status", "text", "end")
+        return self.values in get_args(_Words)
 
 
 def _of_each_parameter(prefix: str, meaning: str, heading: str) -> tuple[Column, ...]:
     """Make a column for each parameter of a particle."""
     return tuple(
         Column(
-            f"{prefix}_{name}", "number" if prefix in ("systematic", "repeat") else "positive",
-            meaning, heading, "kDa" if name == "mass_kda" else "nm",
+            f"{prefix}_{name}",
+            "number" if prefix in ("systematic", "repeat") else "positive",
+            meaning,
+            heading,
+            "kDa" if name == "mass_kda" else "nm",
         )
         for name in PARAMETERS
-    )  # fmt: skip
+    )
 
 
 DIPOLE, NO_MODEL = "dipole", "none"

@@ -48,7 +48,7 @@ from iscat_analysis.findings import Finding
 from iscat_analysis.findings.tracks import BLOCKS_FOLLOW_DRIFT, TRACKED_FRAMES_LEFT_OUT
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.results import Compared, DetectionResult
-from iscat_analysis.movie import Stack, StackFrames
+from iscat_analysis.movie import SelectedFrames, Stack
 from iscat_analysis.records import (
     BoolArray,
     CountSource,
@@ -298,7 +298,7 @@ def keep_frames(
     if good.all() or not good.any():
         return FrameSubset(movie, span)
     numbers = span[0] + np.flatnonzero(good)
-    seen = movie.seen_as(StackFrames(movie, numbers))
+    seen = movie.seen_as(SelectedFrames(movie, numbers))
     missing, share = span[0] + np.flatnonzero(~good), float(np.mean(repeats & ~dark))
     values = {"s": "", "are": "is", "repeat": "repeats", "frames": listed(missing, 4), "many": ""}
     if len(missing) > 1:

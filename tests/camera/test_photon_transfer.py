@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d, gaussian_filter
 
-from iscat_analysis.camera import CameraCalibration, Estimate, measure_camera, regression
+from iscat_analysis.camera import CameraCalibration, Estimate, calibration, measure_camera
 from iscat_analysis.errors import DataError
 
 GAIN, OFFSET, READ_E = 4.0, 100.0, 20.0
@@ -197,9 +197,9 @@ def test_pixels_that_reach_zero_are_left_out(monkeypatch: pytest.MonkeyPatch) ->
             light = context(rng, level=2e4) * np.where(third, 2e-4, 1.0)
             electrons = rng.poisson(light, (160, *SHAPE)) + 5 * rng.standard_normal((160, *SHAPE))
             counts = np.clip(np.rint(electrons / GAIN), 0, 65535).astype(np.uint16)
-            calibration = measure_camera([Movie(counts)])
-            found.append([pull(calibration.gain_e_per_adu, GAIN)])
-            found[-1].append(pull(calibration.offset_adu, 0.0))
+            camera = measure_camera([Movie(counts)])
+            found.append([pull(camera.gain_e_per_adu, GAIN)])
+            found[-1].append(pull(camera.offset_adu, 0.0))
         return found
 
     check_pulls(pulls())
@@ -373,11 +373,11 @@ def test_read_noise_that_is_reported_is_not_selected(monkeypatch: pytest.MonkeyP
     check_unselected(reported_read_noise(truth_e, 300), truth_e)
 
     def whole(found: Any, used: Any, given: float) -> Estimate:
-        line = regression.variance_line(*regression._pooled(found, used))
-        return regression._read_variance((*line[0], line[1]), Estimate(given, 0.0)).adu2
+        line = calibration.variance_line(*calibration._pooled(found, used))
+        return calibration._read_variance((*line[0], line[1]), Estimate(given, 0.0)).adu2
 
-    monkeypatch.setattr(regression, "_half", whole)
-    monkeypatch.setattr(regression, "_READ_NOISE_SIGMAS", 5.0)
-    monkeypatch.setattr(regression, "_unselected", lambda read, *_: read.e2)
+    monkeypatch.setattr(calibration, "_half", whole)
+    monkeypatch.setattr(calibration, "_READ_NOISE_SIGMAS", 5.0)
+    monkeypatch.setattr(calibration, "_unselected", lambda read, *_: read.e2)
     with pytest.raises(AssertionError):
         check_unselected(reported_read_noise(truth_e, 300), truth_e)
