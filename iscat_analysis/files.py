@@ -88,17 +88,13 @@ def take(lock: FileLock, timeout_s: float) -> bool:
     return True
 
 
-_BLOCK_BYTES = 2**24  # of a file, that are in memory at a time
-
-
 def sha256_of_files(files: Sequence[Path], part: str = "") -> str:
     """Hash a movie, without holding it in memory."""
-    digest, room = hashlib.sha256(), memoryview(bytearray(_BLOCK_BYTES))
+    digest = hashlib.sha256()
     for path in files:
         try:
             with path.open("rb", buffering=0) as file:
-                while length := file.readinto(room):
-                    digest.update(room[:length])
+                hashlib.file_digest(file, lambda: digest)
         except OSError as error:
             raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     digest.update(part.encode("utf-8", "backslashreplace"))

@@ -125,7 +125,7 @@ def toml_of(text: str) -> dict[str, Any]:
         raise tomllib.TOMLDecodeError("its brackets are nested too deep") from None
 
 
-def npz_of(content: bytes, names: Sequence[str], most: int) -> dict[str, NDArray[Any]]:
+def npz_of(content: bytes, most: int) -> dict[str, NDArray[Any]]:
     """Read arrays of a ``.npz`` file, of so many bytes at most when they are unpacked."""
     import numpy as np
 
@@ -134,7 +134,7 @@ def npz_of(content: bytes, names: Sequence[str], most: int) -> dict[str, NDArray
             if sum(entry.file_size for entry in file.infolist()) > most:
                 raise ValueError(f"its arrays are larger than {most} bytes")
         with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-            return {name: stored[name] for name in names or stored.files}
+            return {name: stored[name] for name in stored.files}
     except (zipfile.BadZipFile, zlib.error, *OF_DAMAGE) as error:
         raise ValueError(first_line(error)) from None
 

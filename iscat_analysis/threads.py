@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -15,27 +14,27 @@ from threadpoolctl import threadpool_limits
 T = TypeVar("T")
 
 
-@dataclass(frozen=True)
-class _Allotment:
-    count: int
-    stop: Callable[[], None]
-
-
-_ALLOTTED: ContextVar[_Allotment | None] = ContextVar("allotted", default=None)
+_ALLOTTED: ContextVar[tuple[int, Callable[[], None]] | None] = ContextVar("allotted", default=None)
 
 
 def _wanted() -> None:
     """Do nothing: the work is not cancelled."""
 
 
-class _Inline(ThreadPoolExecutor):
-    """Runs each task at once in the calling thread, unless work is cancelled."""
+class _Pool(ThreadPoolExecutor):
+    """Threads that check before each task whether work is cancelled; one alone is the caller's."""
 
-    def __init__(self, stop: Callable[[], None] = _wanted) -> None:
-        super().__init__(1)
-        self._stop = stop
+    def __init__(self, count: int, stop: Callable[[], None] = _wanted) -> None:
+        super().__init__(max(count, 1))
+        self._alone, self._stop = count <= 1, stop
 
     def submit(self, task: Callable[..., Any], /, *args: Any, **options: Any) -> Future[Any]:
+        def watched() -> Any:
+            self._stop()
+            return task(*args, **options)
+
+        if not self._alone:
+            return super().submit(watched)
         self._stop()
         done: Future[Any] = Future()
         try:
@@ -43,21 +42,6 @@ class _Inline(ThreadPoolExecutor):
         except Exception as error:  # noqa: BLE001  # raised where the result is asked for
             done.set_exception(error)
         return done
-
-
-class _Watched(ThreadPoolExecutor):
-    """Threads that check before each task whether work is cancelled."""
-
-    def __init__(self, allotment: _Allotment) -> None:
-        super().__init__(allotment.count)
-        self._stop = allotment.stop
-
-    def submit(self, task: Callable[..., Any], /, *args: Any, **options: Any) -> Future[Any]:
-        def watched(*args: Any, **options: Any) -> Any:
-            self._stop()
-            return task(*args, **options)
-
-        return super().submit(watched, *args, **options)
 
 
 def processors() -> int:
@@ -89,11 +73,7 @@ def threads(count: int) -> Iterator[ThreadPoolExecutor]:
     Linear algebra keeps to the thread that calls it: libraries would start one more for every
     processor in each of ours, and small products then take several times as long.
     """
-    given = _ALLOTTED.get()
-    if given is not None:
-        pool: ThreadPoolExecutor = _Watched(given) if given.count > 1 else _Inline(given.stop)
-    else:
-        pool = ThreadPoolExecutor(count) if count > 1 else _Inline()
+    pool = _Pool(*(_ALLOTTED.get() or (count,)))
     with one_thread_algebra(), pool:
         yield pool
 
@@ -101,7 +81,7 @@ def threads(count: int) -> Iterator[ThreadPoolExecutor]:
 @contextmanager
 def allotted(count: int, stop: Callable[[], None]) -> Iterator[None]:
     """Limit `threads` to the number of an executor, whatever number it is asked for."""
-    token = _ALLOTTED.set(_Allotment(count, stop))
+    token = _ALLOTTED.set((count, stop))
     try:
         yield
     finally:

@@ -22,7 +22,7 @@ from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.instrument.template import MeasuredPicture, measure_template
 from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.movie.tables import read_events
-from iscat_analysis.optics.measured import sha256_of
+from iscat_analysis.optics.waves import sha256_of
 from iscat_analysis.records import FloatArray
 from iscat_analysis.report.calibration import camera_page, mass_page, optics_page, template_page
 from iscat_analysis.schemas import jsonable

@@ -26,7 +26,6 @@ from iscat_analysis.camera.counts import (
     whole_frames,
 )
 from iscat_analysis.camera.drift import (
-    ComplexArray,
     Mover,
     Pattern,
     Trajectory,
@@ -38,12 +37,6 @@ from iscat_analysis.camera.drift import (
     pattern_of,
     still_light,
     trusted,
-)
-from iscat_analysis.camera.gain import (
-    GainDiagnosis,
-    diagnose_gain,
-    shared_light,
-    without_pattern_jitter,
 )
 from iscat_analysis.camera.learned import (
     ASSUMPTION,
@@ -60,17 +53,21 @@ from iscat_analysis.camera.light import (
     find_light,
     with_lines,
 )
+from iscat_analysis.camera.noise import (
+    GainDiagnosis,
+    NoiseSpectrum,
+    Processing,
+    diagnose_gain,
+    find_processing,
+    measure_spectrum,
+    shared_light,
+    without_pattern_jitter,
+)
 from iscat_analysis.camera.pixels import (
     find_unsteady,
     text_finding,
     text_summary,
     unsteady_finding,
     without_text,
-)
-from iscat_analysis.camera.spectrum import (
-    NoiseSpectrum,
-    Processing,
-    find_processing,
-    measure_spectrum,
 )
 from iscat_analysis.camera.transfer import SIGMAS, TOLERANCE, Law, LightZero, Response, find_zero

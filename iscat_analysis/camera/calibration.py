@@ -42,7 +42,7 @@ from scipy.special import log_ndtr
 
 from iscat_analysis.camera.background import unlike_neighbours
 from iscat_analysis.camera.counts import Camera, full_scale_of
-from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
+from iscat_analysis.camera.noise import NoiseSpectrum, measure_spectrum
 from iscat_analysis.errors import DataError
 from iscat_analysis.medians import robust_sigma
 from iscat_analysis.movie import SelectedFrames

@@ -518,6 +518,6 @@ def sampled(movie: CountSource, camera: Camera) -> tuple[CountSource, Camera]:
     return CutFrames(movie, (side, side), sample.taken), sample.camera(camera)
 
 
-def whole_frames(shape: tuple[int, ...], most: int, least: int = 16) -> int:
+def whole_frames(shape: tuple[int, ...], most: int) -> int:
     """Say how many whole frames tell as much as so many of 256 × 256 pixels."""
-    return min(most, max(least, 256**2 * most // math.prod(shape)))
+    return min(most, max(16, 256**2 * most // math.prod(shape)))

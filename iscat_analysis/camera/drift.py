@@ -26,9 +26,7 @@ from scipy import fft
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
 
 from iscat_analysis.medians import SIGMA_PER_MAD, median_3x3, robust_sigma
-from iscat_analysis.records import BoolArray, FloatArray, Mapper
-
-ComplexArray = NDArray[np.complex128]
+from iscat_analysis.records import BoolArray, ComplexArray, FloatArray, Mapper
 
 REACH_PX = 4
 """From the edges of a field, within which a moved pattern is not to be trusted."""

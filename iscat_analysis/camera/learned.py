@@ -28,9 +28,13 @@ from iscat_analysis.camera.counts import (
     padded_bits,
     rounding_variance_adu2,
 )
-from iscat_analysis.camera.gain import averaged_noise, diagnose_gain, without_pattern_jitter
+from iscat_analysis.camera.noise import (
+    averaged_noise,
+    diagnose_gain,
+    measure_spectrum,
+    without_pattern_jitter,
+)
 from iscat_analysis.camera.pixels import find_text, without_text
-from iscat_analysis.camera.spectrum import measure_spectrum
 from iscat_analysis.camera.transfer import (
     TOLD,
     Law,

@@ -49,11 +49,12 @@ import numpy as np
 from numpy.polynomial.legendre import legvander, legvander2d
 from numpy.typing import NDArray
 from scipy import fft
+from scipy.ndimage import median
 from scipy.special import chdtri
 
 from iscat_analysis.camera.background import find_defects
 from iscat_analysis.camera.counts import Camera, float_type
-from iscat_analysis.camera.spectrum import measure_spectrum
+from iscat_analysis.camera.noise import measure_spectrum
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings import camera as of
 from iscat_analysis.medians import robust_sigma
@@ -688,11 +689,9 @@ def _around(power: FloatArray, wide: int) -> FloatArray:
     """Give the median of a half spectrum (y, k) at the distance of each point, and of its lines."""
     high, _ = power.shape
     side = max(high, wide)
-    ring = np.rint(side * np.hypot(np.fft.fftfreq(high)[:, None], np.fft.rfftfreq(wide)))
-    order = np.argsort(ring, axis=None, kind="stable")
-    cuts = np.flatnonzero(np.diff(ring.ravel()[order])) + 1
-    middle = np.array([np.median(part) for part in np.split(power.ravel()[order], cuts)])
-    at_distance: NDArray[np.float64] = middle[np.searchsorted(np.unique(ring), ring)]
+    distance = side * np.hypot(np.fft.fftfreq(high)[:, None], np.fft.rfftfreq(wide))
+    ring = np.rint(distance).astype(int)
+    at_distance: FloatArray = median(power, ring, np.arange(ring.max() + 1))[ring]
     lines = np.maximum(np.median(power, axis=1, keepdims=True), np.median(power, axis=0))
     return np.maximum(at_distance, lines)
 

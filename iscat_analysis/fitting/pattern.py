@@ -24,17 +24,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.camera import (
-    ComplexArray,
-    Mover,
-    Trajectory,
-    filling,
-    follow_pattern,
-    still_light,
-    trusted,
-)
+from iscat_analysis.camera import Mover, Trajectory, filling, follow_pattern, still_light, trusted
 from iscat_analysis.fitting.events import Region
-from iscat_analysis.records import FloatArray, Mapper
+from iscat_analysis.records import ComplexArray, FloatArray, Mapper
 from iscat_analysis.search.frames import Chunk
 from iscat_analysis.search.sliding import STRIDES
 

@@ -176,7 +176,7 @@ class Checkpoint:
             return None
         try:
             content = read_bytes(self._path(number), _LARGEST_PART_BYTES)
-            found = unpacked(npz_of(content, (), _LARGEST_PART_BYTES), self.records)
+            found = unpacked(npz_of(content, _LARGEST_PART_BYTES), self.records)
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
         self.kept += 1

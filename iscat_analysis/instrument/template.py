@@ -50,8 +50,8 @@ from iscat_analysis.optics.forward import (
     peak_per_amplitude,
     with_template,
 )
-from iscat_analysis.optics.measured import Template, lattice_step_nm
 from iscat_analysis.optics.parameters import LEAST_IMAGES, settings_of
+from iscat_analysis.optics.waves import Template, lattice_step_nm
 from iscat_analysis.records import Box, FloatArray, Mapper, Progress, silent
 from iscat_analysis.text import in_toml
 from iscat_analysis.threads import threads

@@ -32,9 +32,8 @@ from iscat_analysis.fitting.events import Region
 from iscat_analysis.fitting.pattern import SPAN, MovingPattern
 from iscat_analysis.last_used import LastUsed
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.optics.model import ComplexArray
 from iscat_analysis.optics.sized import SeatedModel
-from iscat_analysis.records import Candidate, FitResult, FloatArray
+from iscat_analysis.records import Candidate, ComplexArray, FitResult, FloatArray
 from iscat_analysis.search.dating import StepFrame
 from iscat_analysis.search.frames import Chunk
 from iscat_analysis.search.sliding import MapArray

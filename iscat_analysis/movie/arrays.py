@@ -274,6 +274,9 @@ def refuse_disorder(frames: MappedFrames, said: Layout, path: Path) -> None:
 SUFFIXES = (".bin", ".raw")
 """Of files that are looked at in this way."""
 
+_Recorded = tuple[int, int, np.dtype[Any], dict[Path, int]]
+"""Rows, columns and type of frames, and how many of them each file holds."""
+
 _PART = re.compile(r"_\d{4,9}$", flags=re.ASCII)
 _SHAPE = re.compile(r"\(\s*(\d{1,9})\s*,\s*(\d{1,9})\s*\)", flags=re.ASCII)
 _NUMBER = re.compile(r"\d{1,12}", flags=re.ASCII)
@@ -312,14 +315,9 @@ def _settings(stem: str, path: Path) -> list[Path]:
 
 def open_recorded(path: Path) -> FileSet:
     """Open a movie that `description_of` finds described."""
-    named = _named(path) if description_of(path) == path else None
-    if named is not None:
-        frames, rows, columns, stored = named
-        files: tuple[Path, ...] = (path,)
-        counts = {path: frames}
-    else:
-        files = recorded_files(path)
-        rows, columns, stored, counts = _counted(files[:-1], files[-1])
+    files = recorded_files(path)
+    named = _named(path) if len(files) == 1 else None
+    rows, columns, stored, counts = named or _counted(files[:-1], files[-1])
     if sum(counts.values()) < 2:
         raise single_frame(path)
     members = []
@@ -330,15 +328,13 @@ def open_recorded(path: Path) -> FileSet:
                 members.append(MappedFrames(each, shape, stored, offset=0))
                 opened.callback(members[-1].close)
         if named is not None:
-            refuse_disorder(members[0], Layout(*named[:3], stored.str), path)
+            refuse_disorder(members[0], Layout(counts[path], rows, columns, stored.str), path)
         opened.pop_all()
     where = [(m, image) for m, member in enumerate(members) for image in range(member.shape[0])]
     return FileSet(members, files, np.array(where, dtype=np.int64), StackMetadata())
 
 
-def _counted(
-    files: tuple[Path, ...], settings: Path
-) -> tuple[int, int, np.dtype[Any], dict[Path, int]]:
+def _counted(files: tuple[Path, ...], settings: Path) -> _Recorded:
     """Read rows, columns and type, and how many frames each file holds; all of them are needed."""
     values = _read(settings)
     shape = _SHAPE.fullmatch(values.get("save/frame/shape", ""))
@@ -391,7 +387,7 @@ def _read(settings: Path) -> dict[str, str]:
     return {key.strip(): value.strip() for key, value in pairs}
 
 
-def _named(path: Path) -> tuple[int, int, int, np.dtype[Any]] | None:
+def _named(path: Path) -> _Recorded | None:
     """Read shape and type out of a name, if the file is as long as that."""
     match = _NAME.search(path.stem)
     if match is None:
@@ -403,7 +399,7 @@ def _named(path: Path) -> tuple[int, int, int, np.dtype[Any]] | None:
     except OSError:
         return None
     fits = frames * rows * columns * stored.itemsize == size > 0
-    return (frames, rows, columns, stored) if fits else None
+    return (rows, columns, stored, {path: frames}) if fits else None
 
 
 _OF_ARCHIVES = (zipfile.BadZipFile, zlib.error)

@@ -35,16 +35,13 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import j1
 
 from iscat_analysis._kernels.pupil import Pupil, gauss_legendre, make_pupil, orders, zernike
 from iscat_analysis.config import Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.scatterers import Rod, Sphere
-from iscat_analysis.records import FloatArray
-
-ComplexArray = NDArray[np.complex128]
+from iscat_analysis.records import ComplexArray, FloatArray
 
 NEAR_CRITICAL = 0.98
 """NA over n_sample above which the quadrature treats the critical angle."""

@@ -28,17 +28,13 @@ from iscat_analysis.optics.aperture import (
     is_coherent,
     spectrum,
 )
-from iscat_analysis.optics.measured import MeasuredField, Template, sha256_of
 from iscat_analysis.optics.model import ForwardModel, collected_area_nm2, wiggled
 from iscat_analysis.optics.pixels import PixelArea, PixelGrid
 from iscat_analysis.optics.scale import MassScale, carry_refusal
 from iscat_analysis.optics.scatterers import Rod, Sphere, material, rod_of, sphere_of
 from iscat_analysis.optics.sized import sized
-from iscat_analysis.optics.waves import check_table, field_of
+from iscat_analysis.optics.waves import MeasuredField, Template, check_table, field_of, sha256_of
 from iscat_analysis.units import KILODALTON_KG, NM
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
 
 PEAK_SEARCH_RADIUS = 4.0
 """Largest distance, over λ/NA, at which the peak contrast of a calibration is searched: out of

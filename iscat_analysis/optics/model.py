@@ -32,7 +32,6 @@ from functools import cached_property
 from typing import Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iscat_analysis._kernels.hessian import PAIRS, ROWS, derivatives_between, signal_hessian
 from iscat_analysis._kernels.image import signal_gradient, signal_image
@@ -44,21 +43,19 @@ from iscat_analysis.config import Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.last_used import kept
 from iscat_analysis.optics.aperture import Aperture
-from iscat_analysis.optics.measured import MeasuredField
 from iscat_analysis.optics.pixels import PixelArea, PixelGrid, sample_picture
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.optics.scatterers import Material
 from iscat_analysis.optics.waves import (
     Field,
     LatticeField,
+    MeasuredField,
     RadialField,
     axial_table,
     check_names,
     sensitivity_lattices,
 )
-from iscat_analysis.records import FloatArray
-
-ComplexArray = NDArray[np.complex128]
+from iscat_analysis.records import ComplexArray, FloatArray
 
 Values = Sequence[float] | FloatArray
 """Values of the parameters of a particle model."""

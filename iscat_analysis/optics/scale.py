@@ -15,11 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from iscat_analysis.config import Calibration, Optics
-
-FloatArray = NDArray[np.float64]
+from iscat_analysis.records import BoolArray, FloatArray
 
 LARGEST_SCALE_CHANGE = 1 / 3
 """Largest change of the contrast per kDa, from the optics of the standards to others, for which the
@@ -124,9 +123,7 @@ class MassScale:
         rise = self.linear + 2 * self.quadratic * amplitude
         return np.asarray(rise / self.calibration.gradient_per_kda)
 
-    def off_line(
-        self, amplitude: FloatArray, sigma_kda: FloatArray, errors: float
-    ) -> NDArray[np.bool_]:
+    def off_line(self, amplitude: FloatArray, sigma_kda: FloatArray, errors: float) -> BoolArray:
         """Tell which contrasts do not belong to a single mass on the line of a calibration."""
         amplitude, sigma_kda = np.asarray(amplitude, dtype=float), np.asarray(sigma_kda)
         if self.calibration is None or self.calibration.offset == 0.0:

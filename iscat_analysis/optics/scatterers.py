@@ -53,15 +53,12 @@ from dataclasses import dataclass, replace
 from importlib.util import find_spec
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iscat_analysis.config import Optics, Particle
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.last_used import memoize
-from iscat_analysis.records import FloatArray
+from iscat_analysis.records import ComplexArray, FloatArray
 from iscat_analysis.units import sphere_diameter_nm, sphere_mass_kda
-
-ComplexArray = NDArray[np.complex128]
 
 _GOLD = """
 0.64 0.92 13.78   0.77 0.56 11.21   0.89 0.43 9.519   1.02 0.35 8.145   1.14 0.27 7.150

@@ -24,7 +24,6 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iscat_analysis._kernels.hessian import PAIRS
 from iscat_analysis.config import Optics, Particle, SphereKind
@@ -36,10 +35,8 @@ from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.optics.scatterers import SMALLEST_NM, Sphere, has_shells, material
 from iscat_analysis.optics.waves import with_light_of
-from iscat_analysis.records import FloatArray
+from iscat_analysis.records import ComplexArray, FloatArray
 from iscat_analysis.units import sphere_mass_kda
-
-ComplexArray = NDArray[np.complex128]
 
 MASS_STEP = 5e-4
 """Relative step of the mass in differences, a 6000th of the diameter."""

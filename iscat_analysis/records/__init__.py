@@ -40,6 +40,7 @@ from iscat_analysis.records.steps import (
     Box,
     Candidate,
     Clip,
+    ComplexArray,
     CountSource,
     EventView,
     Film,

@@ -19,6 +19,7 @@ from iscat_analysis.config import MODES, SCHEMES, ModeKind, SchemeKind
 from iscat_analysis.findings import Finding, warnings_in
 
 FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 Mapper = Callable[..., Iterable[Any]]

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from iscat_analysis.optics.measured import Template
+from iscat_analysis.optics.waves import Template
 from iscat_analysis.report.numbers import (
     Fact,
     Table,

@@ -36,8 +36,8 @@ from iscat_analysis.optics.forward import (
     signed_peak,
 )
 from iscat_analysis.optics.local import BASES, REFERENCE, WEIGHTS, centre_of, when
-from iscat_analysis.optics.measured import Template
 from iscat_analysis.optics.scatterers import material
+from iscat_analysis.optics.waves import Template
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
 from iscat_analysis.trust.response import (
     COMMON,

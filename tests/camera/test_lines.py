@@ -105,7 +105,7 @@ def test_lines_are_found_as_often_by_chance_as_the_normal_law_says(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """At 2 standard errors, where it can be counted; 4.5 of them are used."""
-    monkeypatch.setattr("iscat_analysis.camera.spectrum.LEAST_SIGMAS", 2.0)
+    monkeypatch.setattr("iscat_analysis.camera.noise.LEAST_SIGMAS", 2.0)
     trials, found = 400, 0
     rng = np.random.default_rng(6)
     for _ in range(trials):

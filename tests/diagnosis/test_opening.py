@@ -11,7 +11,7 @@ from scenes import make_config
 from scipy.ndimage import gaussian_filter, shift
 
 from iscat_analysis.camera import Camera, diagnose_gain
-from iscat_analysis.camera.gain import measure_pattern_jitter
+from iscat_analysis.camera.noise import measure_pattern_jitter
 from iscat_analysis.diagnosis.causes import axes_warning
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack

@@ -29,7 +29,7 @@ from iscat_analysis.executors import open_executor
 from iscat_analysis.fitting.run import packed
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.tables import read_events
-from iscat_analysis.optics.measured import Template
+from iscat_analysis.optics.waves import Template
 from iscat_analysis.reading import read_json, read_parquet
 from iscat_analysis.records import Clip, EventView
 

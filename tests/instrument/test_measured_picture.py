@@ -22,7 +22,7 @@ from iscat_analysis.optics.forward import (
     peak_per_amplitude,
     with_template,
 )
-from iscat_analysis.optics.measured import Template, lattice_step_nm, sha256_of
+from iscat_analysis.optics.waves import Template, lattice_step_nm, sha256_of
 
 PIXEL, ROI = 100.0, 1500.0
 LIGHT = 2e7

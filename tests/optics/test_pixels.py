@@ -13,8 +13,8 @@ import iscat_analysis as ia
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.optics.measured import Template
 from iscat_analysis.optics.pixels import TOLERANCE, PixelArea
+from iscat_analysis.optics.waves import Template
 
 GRADIENT = -3.1e-5  # per kDa, of the peak contrast, as theory would give it
 FINE, SHARES = np.polynomial.legendre.leggauss(16)  # exact to 1e-12 in any pixel here
