@@ -11,7 +11,7 @@ from typing import Any
 
 from iscat_analysis import report
 from iscat_analysis.study import simulate
-from iscat_cli import ending, main
+from iscat_cli import console, main
 
 
 def _wait() -> None:
@@ -38,5 +38,5 @@ def deaf(arguments: list[str]) -> int:
     """Run a command that stops in the middle of what it writes."""
     simulate._counted = _counted  # type: ignore[attr-defined]
     report.fill_report = _fill_report  # type: ignore[assignment]
-    ending.WRITING_GRACE_S = 0.5
+    console.WRITING_GRACE_S = 0.5
     return main(arguments)

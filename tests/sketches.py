@@ -12,12 +12,16 @@ import pytest
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from iscat_analysis.answers import output
 from iscat_analysis.report import movie_page
 from iscat_analysis.report.style import Sketch
 
-PAGES = tuple(
-    importlib.import_module(f"iscat_analysis.report.{name}")
-    for name in ("batch", "benchmark", "bounds", "calibration", "movie_page")
+PAGES = (
+    output,
+    *(
+        importlib.import_module(f"iscat_analysis.report.{name}")
+        for name in ("batch", "benchmark", "bounds", "calibration", "movie_page")
+    ),
 )
 """Modules that publish figures."""
 

@@ -6,6 +6,7 @@ Predicted are, for light N and counts c = f(N), the contrast κ = d ln f/d ln N 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,7 @@ from iscat_analysis.diagnosis.noise import law_finding
 from iscat_analysis.movie import open_stack
 from iscat_analysis.records import StackMetadata
 
-SEEDS = 3
-CLEAN = 20
+SEEDS = 2
 
 
 def _learned(counts: np.ndarray, **settings: float) -> LearnedCamera:
@@ -61,10 +61,12 @@ def test_an_offset_and_light_of_the_room_are_told_apart() -> None:
         assert abs(room.value - 0.1 / 1.1) < 4 * room.se
 
 
-def test_linear_cameras_are_linear() -> None:
-    """Of 20 movies of 8 bits as well, whose rounding is most of the dark noise."""
+def test_linear_cameras_are_linear(repetitions: Callable[[int, int], int]) -> None:
+    """Of movies of 8 bits as well, whose rounding is most of the dark noise."""
     for gain in (4.0, 700.0):
-        laws = [_law(record(seed, linear(gain), frames=192), gain) for seed in range(CLEAN)]
+        laws = [
+            _law(record(seed, linear(gain), frames=192), gain) for seed in range(repetitions(8, 20))
+        ]
         assert {law.kind for law in laws} == {"linear"}
 
 

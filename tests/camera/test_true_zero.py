@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ GAIN = 4.0  # photoelectrons per count
 LEVEL_E = 1e5
 
 
+@cache
 def _raw(
     *, speckle: float = 0.1, flicker: float = 0.01, seed: int = 1, dip: float = 0.01
 ) -> Counts:
@@ -81,11 +83,10 @@ def test_the_ratio_of_an_even_field_is_refused_too(flicker: float) -> None:
     assert not _learned(raw).refusal
 
 
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("flicker", [0.02, 0.001, 0.0])
-@pytest.mark.parametrize("speckle", [0.0, 0.001, 0.02, 0.3])
-def test_raw_counts_are_not(speckle: float, flicker: float, seed: int) -> None:
-    raw = _raw(speckle=speckle, flicker=flicker, seed=seed, dip=0.1 * seed + 0.01)
+@pytest.mark.parametrize(("flicker", "dip"), [(0.02, 0.01), (0.001, 0.11), (0.0, 0.01)])
+@pytest.mark.parametrize(("speckle", "seed"), [(0.0, 0), (0.001, 1), (0.02, 2), (0.3, 3)])
+def test_raw_counts_are_not(speckle: float, seed: int, flicker: float, dip: float) -> None:
+    raw = _raw(speckle=speckle, flicker=flicker, seed=seed, dip=dip)
     for offset in (0.0, 100.0):
         assert not _learned(raw + offset).refusal
 

@@ -47,6 +47,7 @@ def test_what_was_learned_is_not_learned_again(movie: Path, tmp_path: Path) -> N
 def test_a_measured_template_serves_a_fit(
     movie: Path, tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    sketch_figures(monkeypatch)
     out, setup = tmp_path / "picture", str(movie.with_name("setup.toml"))
     given = ["calibrate", "optics", str(movie), "--config", setup, "--measured"]
     assert main([*given, "--free", "focus", "--out", str(out)]) == 2
@@ -56,7 +57,6 @@ def test_a_measured_template_serves_a_fit(
     assert {path.name for path in out.iterdir()} == {
         "optics.toml", "template.npz", "template.json", "template.html", ".iscat-files",
     }  # fmt: skip
-    sketch_figures(monkeypatch)
     with_it = ["--config", setup, "--set", f"optics.file={out / 'optics.toml'}"]
     assert main_fit([str(movie), *with_it, "--out", str(tmp_path / "fits")]) == 0
     table = pd.read_csv(tmp_path / "fits" / "fits.csv")

@@ -21,8 +21,8 @@ SIGMAS = 4.0
 
 def test_many_particles_at_a_time_are_not_taken_for_noise() -> None:
     """One to every square micrometre and 700 frames: their rings are more than the noise."""
-    shape, pixel_nm = (400, 128, 128), 50.0
-    landings = draw_landings(shape, 60, seed=3)
+    shape, pixel_nm = (400, 96, 96), 50.0
+    landings = draw_landings(shape, 34, seed=3)
     microscope = Instrument(wavelength_nm=445.0, na=1.49, focus_nm=-250.0, emission="reciprocal")
     movie = InstrumentMovie(microscope, shape, landings, seed=3, pixel_nm=pixel_nm)
     result = ia.fit_movie(
@@ -46,12 +46,12 @@ def test_many_particles_at_a_time_are_not_taken_for_noise() -> None:
         found["y_px"].to_numpy()[:, None] - landings.y_px,
     )
     near = (apart < 3) & (np.abs(found["frame"].to_numpy()[:, None] - landings.frame) < 12)
-    assert near.any(axis=0).sum() >= 57
+    assert near.any(axis=0).sum() >= 32
     assert near.any(axis=1).all()
     ok = (found["status"] == "ok").to_numpy() & (near.sum(axis=1) == 1)
     truth = landings.mass_kda[near.argmax(axis=1)]
     pulls = ((found["mass_kda"] - truth) / found["sigma_mass_kda"])[ok]
-    assert ok.sum() >= 45
+    assert ok.sum() >= 25
     assert abs(pulls.mean()) < SIGMAS / math.sqrt(ok.sum())
     assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * ok.sum())
 

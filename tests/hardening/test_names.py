@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from sketches import sketch_figures
 from small_movies import SETUP, analysed, put_in_place_of_fits
 
 import iscat_analysis as ia
@@ -27,7 +28,9 @@ WRITTEN = [name.encode("utf-8", "backslashreplace").decode() for name in NAMES]
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
     """Make a movie and its result."""
-    return analysed(tmp_path_factory.mktemp("made"))
+    with pytest.MonkeyPatch.context() as patch:
+        sketch_figures(patch)
+        return analysed(tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture

@@ -96,7 +96,7 @@ MICROSCOPES = {
 @pytest.mark.parametrize("name", MICROSCOPES)
 def test_parameters_lie_within_their_errors(name: str) -> None:
     changes = MICROSCOPES[name]
-    found = _measure(changes, 24, seed=11)
+    found = _measure(changes, 16, seed=11)
     assert not found.refusals
     assert found.configured.uniform_p < HELD_OUT_P
     assert np.abs(_pulls(found, changes)).max() < SIGMAS
@@ -112,7 +112,7 @@ def test_circular_light_and_a_mask_are_recognised() -> None:
 
 
 def test_a_good_configuration_stays() -> None:
-    found = _measure({}, 24, seed=13)
+    found = _measure({}, 16, seed=13)
     assert found.configured.good
     assert not found.refusals
     assert np.abs(_pulls(found, {})).max() < SIGMAS
@@ -120,7 +120,7 @@ def test_a_good_configuration_stays() -> None:
 
 def test_what_may_not_change_is_missed() -> None:
     """Control: without the aberration that the pictures have, they are not described."""
-    found = _measure({"z11": 20.0}, 24, seed=14, free=("focus", "phase"))
+    found = _measure({"z11": 20.0}, 16, seed=14, free=("focus", "phase"))
     assert found.refusals
     assert "not fitted" in found.refusals[0]
 
@@ -161,7 +161,7 @@ def test_no_particle_is_refused_with_what_to_record() -> None:
 
 
 @pytest.mark.parametrize("focus_nm", [-400.0, -200.0])
-@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("count", [1, 5])
 def test_few_particles_tell_what_they_tell(count: int, focus_nm: float) -> None:
     """One is enough for the focus; of what it does not tell the usual error is left."""
     changes = {"focus_nm": focus_nm}
@@ -179,7 +179,7 @@ def test_few_particles_tell_what_they_tell(count: int, focus_nm: float) -> None:
 
 def test_a_parameter_at_its_limit_is_refused() -> None:
     config = configuration()
-    images, _, build = make_particle_images({"na": 1.33}, 15, seed=19)
+    images, _, build = make_particle_images({"na": 1.33}, 10, seed=19)
     search = _search(config, build, ("focus", "na", "phase"))
     found = replace(search, limits={**search.limits, "na": (1.36, 1.5)}).run(images)
     assert any(line.startswith("na = 1.36 lies at its limit") for line in found.refusals)
@@ -192,7 +192,7 @@ def test_a_wrong_pixel_size_is_suspected() -> None:
     said, factor = configuration(), 1.06
     pixel = said.camera.pixel_size_nm
     assert pixel is not None
-    images, _, _ = make_particle_images({}, 18, seed=20)
+    images, _, _ = make_particle_images({}, 12, seed=20)
     larger = said.model_copy(
         update={"camera": said.camera.model_copy(update={"pixel_size_nm": factor * pixel})}
     )

@@ -101,6 +101,7 @@ def test_what_lands_is_no_flicker_and_no_motion(seed: int) -> None:
     assert measure_motion(counts, Camera(), 40) < 0.01
 
 
+@pytest.mark.usefixtures("sketched")
 def test_spheres_are_given_up_where_none_describes_the_brightest_steps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

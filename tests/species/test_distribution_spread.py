@@ -13,7 +13,7 @@ from iscat_analysis.species import Distribution, Efficiency, Searched, describe
 Array = NDArray[np.float64]
 
 MASSES, WIDTHS, SHARES = (66.0, 146.0, 480.0), (4.0, 5.0, 10.0), (0.4, 0.35, 0.25)
-DRAWS = 24
+DRAWS = 16
 
 
 def draw(

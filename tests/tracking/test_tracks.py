@@ -315,7 +315,7 @@ def test_a_track_whose_fits_are_rejected_states_the_errors_that_its_frames_show(
     understated: float, rejected: bool
 ) -> None:
     """Without the factor masses of 100 tracks scatter by 2.5 times their errors."""
-    rng, tracks = np.random.default_rng(14), 100
+    rng, tracks = np.random.default_rng(14), 60
     fits = fits_of([walk(rng, 30, 0.05) for _ in range(tracks)], rng, sigma_nm=40.0)
     columns = [
         f"{kind}_{name}" for kind in ("sigma", "crb") for name in ("x_nm", "y_nm", "mass_kda")
