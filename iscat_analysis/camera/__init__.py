@@ -6,10 +6,15 @@ from iscat_analysis.camera.background import (
     Check,
     add_frames,
     find_defects,
+    find_unsteady,
     measure_windows,
     refine_power,
     smooth_background,
     start_power,
+    text_finding,
+    text_summary,
+    unsteady_finding,
+    without_text,
 )
 from iscat_analysis.camera.calibration import CameraCalibration, Estimate, measure_camera
 from iscat_analysis.camera.counts import (
@@ -62,12 +67,5 @@ from iscat_analysis.camera.noise import (
     measure_spectrum,
     shared_light,
     without_pattern_jitter,
-)
-from iscat_analysis.camera.pixels import (
-    find_unsteady,
-    text_finding,
-    text_summary,
-    unsteady_finding,
-    without_text,
 )
 from iscat_analysis.camera.transfer import SIGMAS, TOLERANCE, Law, LightZero, Response, find_zero

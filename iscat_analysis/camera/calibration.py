@@ -364,9 +364,7 @@ def solve(
             "only; give a dark, or a second level"
         )
     if offset is None:
-        zero = -intercept / slope
-        gradient = np.array([-1 / slope, intercept / slope**2])
-        offset = Estimate(zero, math.sqrt(gradient @ cov @ gradient))
+        offset = zero_of_line((intercept, slope), cov)
         notes.append(
             "offset and read noise cannot be told apart without a dark or a flickering laser: "
             "offset_adu is where the variance would vanish, o − σ_r²/g, and with it "
@@ -565,6 +563,16 @@ def variance_line(
             break
     back = np.array([[1.0, -centre], [0.0, 1.0]])
     return back @ theta, back @ cov @ back.T
+
+
+def zero_of_line(line: Sequence[float] | FloatArray, covariance: FloatArray) -> Estimate:
+    """Find where a line (intercept, slope) is zero.
+
+    Shapes: `covariance` (2, 2).
+    """
+    intercept, slope = line
+    gradient = np.array([-1 / slope, intercept / slope**2])
+    return Estimate(-intercept / slope, math.sqrt(gradient @ covariance @ gradient))
 
 
 def _line(

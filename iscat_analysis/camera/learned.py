@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis.camera.background import find_text, without_text
 from iscat_analysis.camera.counts import (
     Camera,
     camera_from_config,
@@ -34,7 +35,6 @@ from iscat_analysis.camera.noise import (
     measure_spectrum,
     without_pattern_jitter,
 )
-from iscat_analysis.camera.pixels import find_text, without_text
 from iscat_analysis.camera.transfer import (
     TOLD,
     Law,

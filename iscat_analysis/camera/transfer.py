@@ -89,6 +89,7 @@ from iscat_analysis.camera.calibration import (
     unsteady,
     variance_line,
     zero_of_flicker,
+    zero_of_line,
 )
 from iscat_analysis.camera.counts import Camera, converter_ceiling, float_type, full_scale_of
 from iscat_analysis.config import CameraConfig
@@ -184,11 +185,9 @@ def _binned(found: Moments, used: BoolArray, other: FloatArray) -> Transfer:
     y, x = np.nonzero(used)
     tiles = (y // _TILE_PX) * (1 + used.shape[1] // _TILE_PX) + x // _TILE_PX
     freedom = np.full(mean.shape, found.n_frames - 1.0)
-    (intercept, slope), cov = variance_line(mean, variance, freedom, tiles)
-    noise = None
-    if slope > 5.0 * math.sqrt(cov[1, 1]):  # the zero is a quotient by the slope
-        gradient = np.array([-1 / slope, intercept / slope**2])
-        noise = Estimate(-intercept / slope, math.sqrt(gradient @ cov @ gradient))
+    line, cov = variance_line(mean, variance, freedom, tiles)
+    # the zero is a quotient by the slope
+    noise = zero_of_line(line, cov) if line[1] > 5.0 * math.sqrt(cov[1, 1]) else None
     seen = found.slope[used], found.slope_variance[used], mean
     flicker = zero_of_flicker(*seen, tiles)
     _, alone = variance_line(mean, variance, freedom)

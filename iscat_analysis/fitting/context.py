@@ -16,7 +16,6 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.optics.local import (
     LocalModels,
-    ModelsFrom,
     refuse_moving_focus,
     refuse_uneven_field,
     terms_of,
@@ -50,7 +49,7 @@ class AnalysisContext:
     searches: int = 1
     lines: LightModel | PartOfLight | None = None
     # of fitted regions, of their surroundings, and of all that is seen far away
-    local: tuple[LocalModels | ModelsFrom, ...] | None = None
+    local: tuple[LocalModels, ...] | None = None
 
     def model_at(self, x_nm: float, y_nm: float, frame: int | None = None) -> ForwardModel:
         """Give the model for fitted regions at a place, in a frame of the movie."""
@@ -70,9 +69,9 @@ class AnalysisContext:
     def on_tile(self, tile: Tile) -> AnalysisContext:
         """Give the same for a tile, whose places count from its own corner."""
         local, lines, noise = self.local, self.lines, self.templates.noise
-        if isinstance(local, tuple):
+        if local is not None:
             corner_nm = tile.corner[0] * self.pixel_nm, tile.corner[1] * self.pixel_nm
-            local = tuple(ModelsFrom(m, corner_nm) for m in local if isinstance(m, LocalModels))
+            local = tuple(models.on_tile(corner_nm) for models in local)
         if isinstance(lines, LightModel):
             lines = lines.part(tile.here)
         if noise is not None:

@@ -245,31 +245,20 @@ _DIFFERENCE = 1 / (2 * _NODES)  # weight of the outer nodes in σ ∂e/∂λ
 _SMALL = 1e-3  # of κΔ, below which the first terms of series are exact
 
 
-@dataclass(frozen=True)
-class Cone:
-    """A cone of illumination, κ its largest wavenumber across the axis [rad/nm]."""
+def in_cone(fields: FloatArray, kappa: float, x_nm: FloatArray, y_nm: FloatArray) -> FloatArray:
+    """Give the components of fields whose light is a cone, κ its largest wavenumber [rad/nm].
 
-    kappa: float = 0.0
-
-    def added(self, fields: FloatArray, x_nm: FloatArray, y_nm: FloatArray) -> FloatArray:
-        """Give the components of fields behind such illumination.
-
-        Shapes: `fields` (n, components, 2, *points), `x_nm, y_nm` broadcast to points.
-        """
-        if not self.kappa:
-            return fields
-        turn = self.kappa * np.hypot(x_nm, y_nm)
-        far = np.maximum(turn, _SMALL)
-        coherence = np.where(turn > _SMALL, 2 * j1(far) / far, 1 - turn**2 / 8)
-        lost = np.sqrt(np.maximum(1 - (2 * j1(far) / far) ** 2, 0.0)) / far
-        across = np.stack([coherence, *(self.kappa * lost * axis for axis in (x_nm, y_nm))])
-        along = fields[:, :1] * across[None, :, None]
-        return np.concatenate([along[:, :1], fields[:, 1:], along[:, 1:]], axis=1)
-
-    @property
-    def components(self) -> int:
-        """How many components it adds to a field."""
-        return 2 if self.kappa else 0
+    Shapes: `fields` (n, components, 2, *points), `x_nm, y_nm` broadcast to points.
+    """
+    if not kappa:
+        return fields
+    turn = kappa * np.hypot(x_nm, y_nm)
+    far = np.maximum(turn, _SMALL)
+    coherence = np.where(turn > _SMALL, 2 * j1(far) / far, 1 - turn**2 / 8)
+    lost = np.sqrt(np.maximum(1 - (2 * j1(far) / far) ** 2, 0.0)) / far
+    across = np.stack([coherence, *(kappa * lost * axis for axis in (x_nm, y_nm))])
+    along = fields[:, :1] * across[None, :, None]
+    return np.concatenate([along[:, :1], fields[:, 1:], along[:, 1:]], axis=1)
 
 
 class Ray(NamedTuple):
@@ -281,9 +270,9 @@ class Ray(NamedTuple):
     transverse: FloatArray
 
 
-def cone_of(optics: Optics) -> Cone:
-    """Give the cone of illumination of optics."""
-    return Cone(2 * math.pi / optics.wavelength_nm * optics.illumination_na)
+def cone_of(optics: Optics) -> float:
+    """Give the largest wavenumber across the axis of the illumination [rad/nm]."""
+    return 2 * math.pi / optics.wavelength_nm * optics.illumination_na
 
 
 def is_coherent(optics: Optics) -> bool:

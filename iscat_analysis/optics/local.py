@@ -19,6 +19,7 @@ need no more than `WEIGHTS`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -158,6 +159,7 @@ class LocalModels:
         self._terms = terms_of(optics)
         self._centre_px = centre_of(optics, field_px)
         self._pixel_nm = config.camera.pixel_size_nm or 1.0
+        self._corner_nm = 0.0, 0.0
 
         def moved(steps: tuple[tuple[str, int], ...]) -> ForwardModel:
             if not steps:
@@ -168,6 +170,12 @@ class LocalModels:
 
         self._moved = memoize(kept, moved)
 
+    def on_tile(self, corner_nm: tuple[float, float]) -> LocalModels:
+        """Give the same by places that count from the corner of a tile of the field."""
+        there = copy(self)
+        there._corner_nm = corner_nm
+        return there
+
     def rise(self, frame: int) -> int:
         """Give by how many steps of its models the focus has risen in a frame."""
         moves = {name: size for name, size in self._terms.items() if name in MOVES}
@@ -177,23 +185,13 @@ class LocalModels:
     def at(self, x_nm: float, y_nm: float, frame: float | None = None) -> ForwardModel:
         """Give the model of a place, in a frame or in that of which the focus is configured."""
         x, y, half = self._centre_px
+        y_nm, x_nm = y_nm + self._corner_nm[0], x_nm + self._corner_nm[1]
         at_x, at_y = (x_nm / self._pixel_nm - x) / half, (y_nm / self._pixel_nm - y) / half
         spot = when(self._optics, frame)._replace(x=at_x, y=at_y)
         changes = changes_at(self._terms, spot)
         dimming = changes.pop(REFERENCE, 0.0)
         steps = ((base, round(change / STEPS[base])) for base, change in changes.items())
         return brighter(self._moved(tuple(sorted(step for step in steps if step[1]))), dimming)
-
-
-class ModelsFrom:
-    """Models of a movie by places that count from a corner, as those of a tile of the field."""
-
-    def __init__(self, whole: LocalModels, corner_nm: tuple[float, float]) -> None:
-        self._whole, (self._y_nm, self._x_nm) = whole, corner_nm
-
-    def at(self, x_nm: float, y_nm: float, frame: float | None = None) -> ForwardModel:
-        """Give the model of a place; see `LocalModels`."""
-        return self._whole.at(x_nm + self._x_nm, y_nm + self._y_nm, frame)
 
 
 def refuse_moving_focus(config: Config) -> None:

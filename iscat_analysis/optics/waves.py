@@ -26,7 +26,7 @@ import hashlib
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -58,13 +58,13 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.last_used import LastUsed, kept
 from iscat_analysis.optics.aperture import (
     Aperture,
-    Cone,
     Ray,
     aperture_on,
     band_of,
     cone_of,
     factor_at,
     harmonics,
+    in_cone,
     is_coherent,
     over_spectrum,
     spectrum,
@@ -353,12 +353,12 @@ class LatticeField:
     transverse: FloatArray
     band: float
     reach_nm: float
-    cone: Cone = field(default_factory=Cone)
+    cone: float = 0.0
 
     @property
     def count(self) -> int:
         """Components whose light is added up; the first interferes with the reference."""
-        return len(self.harmonics) + self.cone.components
+        return len(self.harmonics) + (2 if self.cone else 0)
 
     @property
     def step_nm(self) -> float:
@@ -409,7 +409,7 @@ class LatticeField:
         side = fields.shape[2]
         axis = self.step_nm * (np.arange(side, dtype=np.float64) - side // 2)
         grouped = fields.reshape(-1, len(self.harmonics), 2, side, side)
-        whole = self.cone.added(grouped, axis[:, None], axis)
+        whole = in_cone(grouped, self.cone, axis[:, None], axis)
         out = undo_window(whole.reshape(-1, side, side))
         return out.reshape(-1, 2, side - 2 * FILTER, side - 2 * FILTER)
 
@@ -438,7 +438,7 @@ class LatticeField:
         dx, dy = (np.ascontiguousarray(d, dtype=float).ravel() for d in (dx_nm, dy_nm))
         out = np.empty((dx.size, 2, len(self.harmonics)))
         sum_waves(self._waves_at(z_nm), 1 / self.radial_step_nm, dx, dy, out)
-        parts = self.cone.added(out.transpose(2, 1, 0)[None], dx, dy)[0]
+        parts = in_cone(out.transpose(2, 1, 0)[None], self.cone, dx, dy)[0]
         return np.asarray(parts[:, 0] + 1j * parts[:, 1]).reshape(-1, *np.shape(dx_nm))
 
     @kept(_HEIGHTS_KEPT)

@@ -13,7 +13,7 @@ from scipy.ndimage import fourier_shift
 
 import iscat_analysis as ia
 from iscat_analysis.camera import Camera, check_counts
-from iscat_analysis.camera.pixels import boxes_of, find_text
+from iscat_analysis.camera.background import boxes_of, find_text
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis import find_stretches
 from iscat_analysis.diagnosis.frames import channels_of
