@@ -89,7 +89,7 @@ def measure_windows(
 
     def summed(span: tuple[int, int]) -> FloatArray:
         sum_e = np.zeros(shape)
-        for start, stop in _blocks(stack.shape, span):
+        for start, stop in blocks(stack.shape, span):
             counts = stack.read(start, stop)
             check(counts, start)
             saturated[...] |= camera.saturated(counts).any(axis=0)
@@ -234,8 +234,11 @@ def _check_ranges(
         )
 
 
-def _blocks(shape: tuple[int, int, int], span: tuple[int, int]) -> list[tuple[int, int]]:
-    size = max(1, _BLOCK_BYTES // (8 * shape[1] * shape[2]))
+def blocks(
+    shape: tuple[int, int, int], span: tuple[int, int], most_bytes: int = _BLOCK_BYTES
+) -> list[tuple[int, int]]:
+    """Divide a range of frames into such as fit into memory, in doubles."""
+    size = max(1, most_bytes // (8 * shape[1] * shape[2]))
     return [(a, min(a + size, span[1])) for a in range(span[0], span[1], size)]
 
 
@@ -250,7 +253,7 @@ def _median(
     for top in range(0, rows, band):
         electrons = [
             camera.to_electrons(stack.read(start, stop))[:, top : top + band]
-            for start, stop in _blocks(stack.shape, span)
+            for start, stop in blocks(stack.shape, span)
         ]
         out[top : top + band] = np.median(np.concatenate(electrons) / level, axis=0)
     return out

@@ -40,7 +40,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from iscat_analysis.camera.background import unlike_neighbours
+from iscat_analysis.camera.background import blocks, unlike_neighbours
 from iscat_analysis.camera.counts import Camera, full_scale_of
 from iscat_analysis.camera.noise import NoiseSpectrum, measure_spectrum
 from iscat_analysis.errors import DataError
@@ -49,6 +49,7 @@ from iscat_analysis.movie import SelectedFrames
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, FrameSource, Progress, silent
 from iscat_analysis.units import are, frames_listed
 
+_CACHE_BYTES = 4 * 2**20  # what lies in a processor's cache takes no fresh memory
 _TOGETHER = {"frames": (1, 2), "rows": (2,), "columns": (1,)}  # axes of (t, y, x)
 
 
@@ -68,15 +69,6 @@ class Moments:
     def relative_se(self) -> float:
         """Standard error of one pixel's variance, relative (von Neumann et al., 1941)."""
         return math.sqrt(3 * self.n_frames - 4) / (self.n_frames - 1)
-
-
-def blocks(stack: FrameSource) -> Iterator[tuple[int, int]]:
-    """Divide a stack into ranges of frames that fit into memory."""
-    frames, rows, columns = stack.shape
-    # in doubles: what lies in a processor's cache takes no fresh memory
-    size = max(2, (4 * 2**20) // (8 * rows * columns))
-    for start in range(0, frames, size):
-        yield start, min(start + size, frames)
 
 
 def brightness_bins(mean: FloatArray) -> list[NDArray[np.intp]]:
@@ -117,7 +109,7 @@ def moments_of(
     highest = lowest = stack.read(0, 1)[0]
     flicker = []
     last: FloatArray | None = None
-    for start, stop in blocks(stack):
+    for start, stop in blocks(stack.shape, (0, stack.shape[0]), _CACHE_BYTES):
         counts = stack.read(start, stop)
         if not np.isfinite(counts).all():
             raise DataError(
@@ -691,7 +683,7 @@ def noise_curve(
             earlier = total
 
     def single() -> Iterator[FloatArray]:
-        for start, stop in blocks(stack):
+        for start, stop in blocks(stack.shape, (0, stack.shape[0]), _CACHE_BYTES):
             yield from stack.read(start, stop)[:, used] - result.offset.value
             progress("noise curve", stop, frames)
 
@@ -849,7 +841,8 @@ def _moments_with_light(
     stack: FrameSource, floor: float, masked: dict[str, BoolArray], advance: Callable[[int], None]
 ) -> Moments:
     """Measure the moments of a stack, and add pixels that are not to be used to those masked."""
-    first = _glance(stack)
+    places = np.unique(np.linspace(0, stack.shape[0] - 1, 16).astype(int)).tolist()
+    first = np.concatenate([stack.read(place, place + 1) for place in places])
     odd = masked["hot"] | masked["dead"] | saturated(first.max(axis=0), stack.name)
     lit = ~np.logical_or.reduce([odd, *unlike_neighbours(first.mean(axis=0) - floor)])
     measured = moments_of(stack, lit, advance)
@@ -925,13 +918,6 @@ def _checked(light: Sequence[FrameSource], dark: FrameSource | None, maps: bool)
             f"`maps` needs {LEAST_FRAMES_FOR_MAPS} frames or more, not {frames}: with fewer the "
             "gain of one pixel is all noise"
         )
-
-
-def _glance(stack: FrameSource) -> NDArray[Any]:
-    """Read a few frames from all over the stack."""
-    frames = stack.shape[0]
-    places = np.unique(np.linspace(0, frames - 1, 16).astype(int))
-    return np.concatenate([stack.read(int(k), int(k) + 1) for k in places])
 
 
 def _curve(
@@ -1021,7 +1007,7 @@ def without_repeats(stack: CountSource, least: int, notes: list[str]) -> CountSo
     total = stack.shape[0]
     good = np.zeros(total, dtype=np.bool_)
     last: NDArray[Any] | None = None
-    for start, stop in blocks(stack):
+    for start, stop in blocks(stack.shape, (0, stack.shape[0]), _CACHE_BYTES):
         for k, frame in enumerate(stack.read(start, stop), start):
             good[k] = frame.any() and not (last is not None and np.array_equal(frame, last))
             last = frame

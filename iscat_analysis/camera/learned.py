@@ -62,8 +62,6 @@ _MOST_FRAMES, _MOST_COUNTS = 1024, 2**23  # that are looked at: it takes a secon
 _LEAST_FRAMES = 8
 _FIRST_FRAMES = 64  # that may be dark, and that tell of noise and motion
 _DARK_LIGHT_SHARE = 0.5  # of the usual counts, below which a frame may be without light
-# of what the counts of dark frames would show, if they were light: its error, and itself
-_LIT_SHARE_ERROR, _LIT_SHARE = 0.1, 0.1
 
 
 def sample(
@@ -118,8 +116,8 @@ def _is_dark(dark: NDArray[Any], lit: NDArray[Any]) -> bool:
     share = float(np.sum(apart * pattern)) / power if power > 0 else 0.0
     rest = float(np.mean((apart - share * pattern) ** 2))
     error = math.sqrt(rest / power) if power > 0 else math.inf
-    if error < _LIT_SHARE_ERROR * as_light:
-        return abs(share) < _LIT_SHARE * as_light + 3 * error
+    if error < 0.1 * as_light:  # a tenth of what the counts would show, if they were light
+        return abs(share) < 0.1 * as_light + 3 * error
     noise = noise_adu2(dark) if len(dark) > 1 else noise_adu2(np.moveaxis(dark, 2, 0))
     # half of the noise that its counts would have as light
     return noise < 0.5 * as_light * noise_adu2(lit)

@@ -801,15 +801,8 @@ _MOST_NAMES = 20_000  # of all frames of a long movie
 
 def with_side_files(metadata: StackMetadata, movie: Path) -> StackMetadata:
     """Fill what a movie does not say of itself from the texts beside it."""
-    for path in _beside(movie):
-        told = _told_in(path)
-        fresh = {
-            name: value for name, value in told.values.items() if getattr(metadata, name) is None
-        }
-        if fresh:
-            sources = [metadata.source] if metadata.source != "none" else []
-            metadata = replace(metadata, **fresh, source="+".join([*sources, path.name]))
-    return metadata
+    texts = (replace(_told_in(path), source=path.name) for path in _beside(movie))
+    return merge([Hints(metadata), *map(Hints, texts)], movie)
 
 
 def _beside(movie: Path) -> Iterator[Path]:
