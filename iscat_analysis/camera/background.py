@@ -304,7 +304,6 @@ _FRAMES, _TOGETHER, _COUNTS = 128, 8, 2**24  # that are looked at, in groups all
 _FEWEST = 16
 _AGAIN = 0.02  # of the frames that have the same count, at least and at most
 _LEAST_PIXELS = 8  # of a text
-_MARGIN = 1  # pixel around a text, for letters that are smooth
 
 
 def text_finding(text: BoolArray, name: str) -> Finding:
@@ -377,7 +376,8 @@ def find_text(movie: Stack, span: tuple[int, int]) -> BoolArray | None:
         if inside[0].size >= _LEAST_PIXELS:
             corners = zip(box, inside, strict=True)
             spans = [(part.start + int(k.min()), part.start + int(k.max())) for part, k in corners]
-            text[tuple(slice(max(a - _MARGIN, 0), b + _MARGIN + 1) for a, b in spans)] = True
+            # and one around them, for letters that are smooth
+            text[tuple(slice(max(a - 1, 0), b + 2) for a, b in spans)] = True
     return text if 0 < text.mean() < 0.25 else None  # of the field
 
 
