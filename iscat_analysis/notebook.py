@@ -22,7 +22,7 @@ from iscat_analysis.answers.calibrations import optics_calibration
 from iscat_analysis.bounds import bounds_report, parse_scan, scan
 from iscat_analysis.bounds.shared import EVENTS, OpticsForecast
 from iscat_analysis.bounds.shared import forecast_optics as _forecast
-from iscat_analysis.config import LARGEST_NM, Config, configure
+from iscat_analysis.config import LARGEST_NM, Config, Source, configure
 from iscat_analysis.executors import THREADS, open_executor
 from iscat_analysis.findings import Finding
 from iscat_analysis.fitting.run import Run
@@ -52,6 +52,9 @@ from iscat_analysis.units import count
 
 if TYPE_CHECKING:
     from arviz import InferenceData
+
+Settings = Mapping[str, Any] | Iterable[str]
+"""Values of the configuration by key, or as ``"section.key = value"``."""
 
 ROWS_SHOWN = 20
 """Events that a `Result` shows of itself in a notebook."""
@@ -422,8 +425,8 @@ def fit_movie(
     movie: str | Path | ArrayLike,
     *,
     name: str | None = None,
-    config: str | Path | Mapping[str, Any] | Config | None = None,
-    settings: Mapping[str, Any] | Iterable[str] | None = None,
+    config: Source | None = None,
+    settings: Settings | None = None,
     mode: str | None = None,
     background: tuple[int, int] | None = None,
     frames: tuple[int, int] | None = None,
@@ -519,8 +522,8 @@ def calibrate_optics(
     movie: str | Path | ArrayLike,
     *,
     name: str | None = None,
-    config: str | Path | Mapping[str, Any] | Config | None = None,
-    settings: Mapping[str, Any] | Iterable[str] | None = None,
+    config: Source | None = None,
+    settings: Settings | None = None,
     free: str | Sequence[str] | None = None,
     focus_step_nm: float | None = None,
     out: str | Path | None = None,
@@ -576,11 +579,11 @@ def calibrate_optics(
 
 
 def simulate_movie(
-    config: str | Path | Mapping[str, Any] | Config,
+    config: Source,
     path: str | Path,
     *,
     seed: int | None = None,
-    settings: Mapping[str, Any] | Iterable[str] | None = None,
+    settings: Settings | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> pd.DataFrame:
@@ -625,10 +628,7 @@ def simulate_movie(
 
 
 def compute_bounds(
-    config: str | Path | Mapping[str, Any] | Config | None = None,
-    *,
-    settings: Mapping[str, Any] | Iterable[str] | None = None,
-    mode: str | None = None,
+    config: Source | None = None, *, settings: Settings | None = None, mode: str | None = None
 ) -> Bounds:
     """Compute what no estimate from a planned experiment can beat.
 
@@ -656,9 +656,9 @@ def compute_bounds(
 
 
 def forecast_optics(
-    config: str | Path | Mapping[str, Any] | Config | None = None,
+    config: Source | None = None,
     *,
-    settings: Mapping[str, Any] | Iterable[str] | None = None,
+    settings: Settings | None = None,
     events: int = EVENTS,
     free: str | Sequence[str] | None = None,
 ) -> OpticsForecast:
@@ -711,11 +711,7 @@ _KEYS = {
 """Argument → key of the configuration."""
 
 
-def _resolved(
-    config: str | Path | Mapping[str, Any] | Config | None,
-    settings: Mapping[str, Any] | Iterable[str] | None,
-    given: Mapping[str, Any],
-) -> Config:
+def _resolved(config: Source | None, settings: Settings | None, given: Mapping[str, Any]) -> Config:
     """Make a configuration with the keys that arguments stand for; messages name the arguments."""
     arguments = {_KEYS[name]: value for name, value in given.items() if value is not None}
     called = {_KEYS[name]: name for name in given if given[name] is not None}
