@@ -29,15 +29,15 @@ settings.load_profile("ci" if os.environ.get("CI") else "here")
 
 
 LONGEST_FIRST = (
-    "test_output", "test_app_browser", "test_report_browser", "test_report", "test_cluster",
-    "test_landing", "test_day", "test_optics_calibration", "test_pipeline", "test_movers",
-    "test_compilation", "test_cli_help", "test_public", "test_bad_input", "test_uneven",
-    "test_crowded", "test_tracked_optics", "test_detect", "test_cause", "test_equilibrium",
-    "test_posterior", "test_floating_optics", "test_photon_transfer", "test_camera_laws",
-    "test_together", "test_doors", "test_processed", "test_cli_contract", "test_distribution",
-    "test_mass_calibration", "test_breaks", "test_fuzz", "test_event_tables", "test_bounds",
-    "test_recognise", "test_learning", "test_cli_json", "test_cli_optics", "test_cli_init",
-    "test_napari",
+    "test_app_browser", "test_report_browser", "test_report", "test_learning", "test_day",
+    "test_output", "test_optics_calibration", "test_pipeline", "test_landing", "test_cli_help",
+    "test_cluster", "test_movers", "test_contrast_sign", "test_benchmark", "test_equilibrium",
+    "test_cli_benchmark", "test_public", "test_uneven", "test_napari", "test_cli_init",
+    "test_camera_laws", "test_fuzz", "test_cli_contract", "test_breaks", "test_floating_optics",
+    "test_doors", "test_preview", "test_tracked_optics", "test_cause", "test_challenge",
+    "test_bounds", "test_contrast_regions", "test_reach", "test_cli_optics", "test_true_zero",
+    "test_distribution_spread", "test_noise_judged", "test_photon_transfer", "test_compilation",
+    "test_crowded", "test_posterior", "test_bad_input", "test_blocks", "test_hostile_files",
 )  # fmt: skip
 """Modules that take longest; they are begun first, so that no worker is left with one."""
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from deaf import deaf
+from commands import deaf
 from forks import fork, send
 from numpy.typing import NDArray
 

@@ -6,9 +6,12 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 import typer
+from commands import within
+from forks import fork
 
 from iscat_analysis.errors import ConfigError
 from iscat_cli import INTERRUPTED
@@ -110,23 +113,19 @@ def test_commands_name_options_where_the_library_names_arguments(
     assert capsys.readouterr().err == f"iscat fit: error: {shown}\n"
 
 
-def test_impossible_lengths_end_at_once_and_small() -> None:
+def test_impossible_lengths_end_at_once_and_small(tmp_path: Path) -> None:
     settings = {
         "optics.wavelength_nm=0.525": "write 525",
         "optics.wavelength_nm=5.25": "not between 200 and 3000 nm",
         "bounds.pixels=4096": "MB",
     }
-    code = (
-        "import resource, sys; from iscat_cli import main; "
-        "resource.setrlimit(resource.RLIMIT_AS, (6 * 2**30,) * 2); "
-        "given = ['bounds', '--set', 'camera.pixel_size_nm=84.4', '--set']; "
-        "sys.exit([main([*given, each]) for each in sys.argv[1:]] != [2, 2, 2])"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, *settings], capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 0
-    lines = done.stderr.splitlines()
+    given = ["bounds", "--set", "camera.pixel_size_nm=84.4", "--set"]
+    log = tmp_path / "err"
+    commands = [[*given, each] for each in settings]
+    process = fork(within, 6 * 2**30, commands, folder=tmp_path, err=log)
+    process.join(120)
+    assert process.exitcode == 2
+    lines = log.read_text().splitlines()
     assert len(lines) == 3
     assert all(said in line for line, said in zip(lines, settings.values(), strict=True))
 

@@ -110,13 +110,13 @@ class _Regions:
     Their peak contrast per mass is known, as from theory: it is that of the field, between pixels.
     """
 
-    def __init__(self, pixel_nm: float, seed: int) -> None:
+    def __init__(self, pixel_nm: float, seed: int, count: int = 60) -> None:
         random = np.random.default_rng(seed)
         self.config = _config(pixel_nm)
         self.pixel_nm, side = pixel_nm, 2 * round(1300 / pixel_nm) + 1
         grid = PixelGrid.centred(side, pixel_nm)
         model = forward_model(self.config, 2 * grid.diagonal_nm)
-        self.masses = random.uniform(200.0, 2000.0, 60)
+        self.masses = random.uniform(200.0, 2000.0, count)
         light, frames = 1e5, 50
         self.frames = frames
         signals = []
@@ -161,7 +161,7 @@ def test_masses_are_right_where_the_gradient_is_known(pixel_nm: float, lost: flo
 
 def test_masses_by_standards_do_not_change() -> None:
     """A line measured with the same model has the same share of the contrast missing."""
-    regions, masses = _Regions(84.0, 8), {}
+    regions, masses = _Regions(84.0, 8, count=12), {}
     for samples in ("auto", 1):
         fits = regions.fits(samples_per_pixel=samples)
         contrast, sizes = fits["contrast"].to_numpy(), regions.masses

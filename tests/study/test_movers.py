@@ -360,7 +360,7 @@ def test_a_particle_above_the_surface_is_seen_at_its_heights() -> None:
 def test_the_same_seed_writes_the_same_bytes(tmp_path: Path) -> None:
     kinds = [{"count": 2, "d_um2_s": 0.8}, {"count": 1, "d_um2_s": 0.1, "mass_kda": 300.0}]
     files = []
-    for name, workers, seed in (("a", 1, 9), ("b", 1, 9), ("c", 3, 9), ("d", 1, 10)):
+    for name, workers, seed in (("a", 1, 9), ("b", 3, 9), ("c", 1, 10)):
         config = _config(
             {"movers": kinds, "events": [EVENT], "power_noise": 0.01, "frames": 20},
             compute={"workers": workers},
@@ -368,9 +368,9 @@ def test_the_same_seed_writes_the_same_bytes(tmp_path: Path) -> None:
         write_stack(config, tmp_path / f"{name}.tif", seed=seed)
         content = (tmp_path / f"{name}.tif").read_bytes().replace(f"{name}.tif".encode(), b"")
         files.append((content, (tmp_path / f"{name}.truth.csv").read_bytes()))
-    assert files[0] == files[1] == files[2]
-    assert files[3][0] != files[0][0]
-    assert files[3][1] != files[0][1]
+    assert files[0] == files[1]
+    assert files[2][0] != files[0][0]
+    assert files[2][1] != files[0][1]
     truth = pd.read_csv(tmp_path / "a.truth.csv")
     assert tuple(truth.columns) == (*TRUTH_COLUMNS, *TRACK_COLUMNS)
     assert truth["event"].tolist() == list(range(len(truth)))

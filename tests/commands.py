@@ -1,8 +1,9 @@
-"""Commands that do not answer an interrupt."""
+"""Commands that tests run in processes of their own: deaf to interrupts, or of little memory."""
 
 from __future__ import annotations
 
 import itertools
+import resource
 import sys
 import time
 from collections.abc import Iterator
@@ -40,3 +41,10 @@ def deaf(arguments: list[str]) -> int:
     report.fill_report = _fill_report  # type: ignore[assignment]
     console.WRITING_GRACE_S = 0.5
     return main(arguments)
+
+
+def within(memory: int, commands: list[list[str]]) -> int:
+    """Run commands in so many bytes of addresses; give the status that all of them have, or 99."""
+    resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    statuses = {main(arguments) for arguments in commands}
+    return statuses.pop() if len(statuses) == 1 else 99
