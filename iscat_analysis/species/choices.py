@@ -55,10 +55,7 @@ MOST_RUNGS = 12
 """Rungs that a ladder without given steps may have."""
 
 _BIC_TIE = 6.0  # of BIC
-_MOST_FREE_MULTIPLES = 4  # multiples that a free species may be
-_REACH = 0.97  # quantile of the masses that the ladder must reach
 _MOST_RELATIVE_WIDTH = 0.35  # of the mass, or of a ladder's monomer: wider is no rung
-_SEARCH = np.linspace(0.85, 1.15, 31)  # of the monomer that was named
 
 
 @dataclass(frozen=True)
@@ -167,9 +164,8 @@ class Ladder:
         if self.monomer_kda is not None:
             return self._from(events, self.monomer_kda)
         free = Searched().choose(events).best
-        wanted = sorted(
-            {float(m / n) for m in peaks(events, free) for n in range(1, _MOST_FREE_MULTIPLES + 1)}
-        )
+        # a free species may be one to four monomers
+        wanted = sorted({float(m / n) for m in peaks(events, free) for n in range(1, 5)})
         least = 0.5 * float(events.x.min())
         found = [self._from(events, m) for m in wanted if m >= least]
         n = events.x.size
@@ -182,7 +178,8 @@ class Ladder:
         if self.steps:
             steps = tuple(sorted(self.steps))
         else:
-            top = round(float(np.quantile(events.x, _REACH)) / monomer)
+            # quantile of the masses that the ladder must reach
+            top = round(float(np.quantile(events.x, 0.97)) / monomer)
             steps = tuple(range(1, max(1, min(top, MOST_RUNGS)) + 1))
         found = self._fit(events, monomer, steps)
         tried = [found.best]
@@ -210,7 +207,8 @@ class Ladder:
     def _fit(self, events: Events, monomer: float, steps: Sequence[int]) -> Chosen:
         n = np.array(steps, dtype=np.float64)
         free = [not self.held, self.offset and (self.held or n.size > 1)]
-        begin = [1.0] if self.held else _SEARCH
+        # around the monomer that was named
+        begin = [1.0] if self.held else np.linspace(0.85, 1.15, 31)
         starts = [_start(events, n * monomer * s, self.background) for s in begin]
         start = max(starts, key=partial(height, events))
         slopes = np.stack([n, np.ones(n.size)], axis=1)[:, free]
@@ -259,14 +257,8 @@ def _start(events: Events, mean: FloatArray, background: bool = False) -> Mixtur
     return near.on_background(*broad(events), FIRST_SHARE) if background else near
 
 
-_POLISHED = 2  # starts, the best after climbing
 FIRST_SHARE = 0.05
 """Of the background, at a start."""
-
-_BROAD = 4.0  # whole widths that the others would have
-_AROUND, _GRID = (4.0, 81)  # of a component: widths to both sides that are searched for maxima
-_ZOOMS, _ZOOM_POINTS = 4, 41  # towards the highest point of a peak
-_APART = 1e-3  # of a width: points that are nearer would have maxima of rounding between them
 
 
 def fit_species(
@@ -280,7 +272,8 @@ def fit_species(
             start = start.on_background(*broad(events), FIRST_SHARE)
         starts = [start, *(split_starts(events, fits[-1]) if fits else ())]
         climbed = sorted((ascend(events, one) for one in starts), key=partial(height, events))
-        tried = [polish(events, one) for one in climbed[-_POLISHED:]]
+        # starts, the best after climbing
+        tried = [polish(events, one) for one in climbed[-2:]]
         fits.append(max(tried, key=lambda fit: fit.log_likelihood))
         bic = [fit.bic(events.x.size) for fit in fits]
         if k >= least and len(fits) - 1 - int(np.argmin(bic)) >= 2:
@@ -335,7 +328,8 @@ def by_peaks(events: Events, fit: Mixture) -> Mixture:
         np.exp(np.average(np.log(whole / form), weights=weight)) * form
         for form in (np.sqrt(mean), np.ones(mean.shape))
     ]
-    wide = whole > _BROAD * np.maximum(*usual)
+    # whole widths that the others would have
+    wide = whole > 4.0 * np.maximum(*usual)
     if wide.all():
         wide[:] = False
     kind = np.full(fit.narrow, BACKGROUND)
@@ -361,10 +355,11 @@ def top_of(weight: FloatArray, mean: FloatArray, total: FloatArray) -> float:
     Shapes: `weight, mean, total` (k,).
     """
     low, high = float(mean.min()), float(mean.max())
-    for _ in range(_ZOOMS):
+    # towards the highest point of a peak
+    for _ in range(4):
         if high <= low:
             break
-        grid = np.linspace(low, high, _ZOOM_POINTS)
+        grid = np.linspace(low, high, 41)
         top = grid[int(np.argmax(_density(grid, weight, mean, total)))]
         step = grid[1] - grid[0]
         low, high = max(low, top - step), min(high, top + step)
@@ -381,8 +376,10 @@ def _density(
 
 def _valleys(weight: FloatArray, mean: FloatArray, whole: FloatArray) -> FloatArray:
     """Give the minima between the maxima of a sum of components."""
-    grid = np.sort((mean + np.outer(np.linspace(-_AROUND, _AROUND, _GRID), whole)).ravel())
-    grid = grid[np.diff(grid, prepend=-np.inf) > _APART * whole.min()]
+    # widths to both sides of a component in which maxima are searched, and points
+    grid = np.sort((mean + np.outer(np.linspace(-4.0, 4.0, 81), whole)).ravel())
+    # of a width: points that are nearer would have maxima of rounding between them
+    grid = grid[np.diff(grid, prepend=-np.inf) > 1e-3 * whole.min()]
     density = _density(grid, weight, mean, whole**2)
     high = np.flatnonzero((density[1:-1] > density[:-2]) & (density[1:-1] >= density[2:])) + 1
     return np.array([grid[i + int(np.argmin(density[i:j]))] for i, j in pairwise(high)])

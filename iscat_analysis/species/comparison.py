@@ -53,8 +53,6 @@ COMPARISON_COLUMNS = (
 """Columns of `Comparison.species`: the second sample is the other, shift and difference are the
 other's less the first's, intervals are 95 %, fractions are of the particles that came."""
 
-_MOST_RELATIVE_WIDTH = 0.3  # width over mass
-
 
 @dataclass(frozen=True)
 class Test:
@@ -105,7 +103,8 @@ def compare(first: Events, other: Events, start: Mixture) -> Comparison:
     """Compare two samples that hold the species of `start`."""
     known, samples = start.species, (first, other)
     seen = np.array([start.shares(events).sum(axis=0)[:known] for events in samples])
-    narrow = start.widths()[:known] < _MOST_RELATIVE_WIDTH * start.means()[:known]
+    # largest width over mass of a species that is compared
+    narrow = start.widths()[:known] < 0.3 * start.means()[:known]
     moves = (seen.min(axis=0) >= LEAST_COMPARED) & narrow
     noise = float(np.median(np.concatenate([events.variance for events in samples])))
     free = _Hypothesis(samples, start, moves, noise, own_fractions=True)

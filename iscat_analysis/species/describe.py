@@ -74,8 +74,6 @@ others."""
 
 _UNBIASED: Literal["weibull"] = "weibull"  # of few draws other quantiles lie too far inside
 _MOST_RELATIVE_WIDTH = 0.4  # width over mass
-_SKEWED = 0.02  # of the mass: how far from it a mean is told
-_NO_LADDER = 0.01  # p-value
 _DIGITS = 6  # of the curves in summary.json
 
 
@@ -226,7 +224,9 @@ def describe(
     ladder = _ladder(choice, found, repeats, scale_error) if isinstance(choice, Ladder) else None
     bandwidth = bandwidth_of(events, max(best.species, 1))
     findings += [*_skews(best, species), *_remarks(species, doubtful)]
-    findings += existing([_brief(species, window_frames), _doubt(ladder)])
+    findings += existing([_brief(species, window_frames)])
+    if ladder is not None and ladder.p_value < 0.01:
+        findings.append(NO_LADDER({"monomer_kda": ladder.monomer_kda, "p_value": ladder.p_value}))
     return replace(
         result,
         species=species,
@@ -355,13 +355,6 @@ def _ladder(
     return LadderFit(steps=found.steps, held=choice.held, p_value=found.p_value, **numbers)
 
 
-def _doubt(ladder: LadderFit | None) -> Finding | None:
-    """Say where masses are no ladder."""
-    if ladder is None or not ladder.p_value < _NO_LADDER:
-        return None
-    return NO_LADDER({"monomer_kda": ladder.monomer_kda, "p_value": ladder.p_value})
-
-
 def _residence(events: Events, mass: FloatArray, window_frames: int | None) -> FloatArray:
     """Frames that a particle of each species must stay for a detection probability of one half."""
     if window_frames is None or events.efficiency is None:
@@ -387,7 +380,8 @@ def _skews(best: Mixture, species: pd.DataFrame) -> Iterator[Finding]:
         mass, mean = species["mass_kda"][number], species["mean_kda"][number]
         if own.size > 1 and not species["outlier"][number]:
             beside = best.mean[own[np.argmax(np.abs(best.mean[own] - mass))]]
-            means = "" if abs(mean / mass - 1) < _SKEWED else f", and its mean is {mean:.4g} kDa"
+            # share of the mass from which on a mean that differs from it is told
+            means = "" if abs(mean / mass - 1) < 0.02 else f", and its mean is {mean:.4g} kDa"
             masses = {"mass_kda": float(mass), "beside_kda": float(beside)}
             yield SKEWED_PEAK(masses | {"mean": means})
 
@@ -436,8 +430,6 @@ _NOISES = np.linspace(0.05, 0.95, 10)  # quantiles that stand for the errors of 
 
 POINTS = 300
 """Of a curve."""
-
-_MOST_BINS = 240
 
 
 def bandwidth_of(events: Events, species: int) -> float:
@@ -506,9 +498,9 @@ def _reach(events: Events) -> float:
 def _edges(events: Events) -> FloatArray:
     """Edges of bins about as wide as the errors allow."""
     reach = _reach(events)
+    # bins of a figure at most
     wanted = max(
-        2.0 * float(np.median(events.sigma)) * (events.x.size / 3) ** (-1 / 3) * 1.7,
-        reach / _MOST_BINS,
+        2.0 * float(np.median(events.sigma)) * (events.x.size / 3) ** (-1 / 3) * 1.7, reach / 240
     )
     width = round_width(wanted)
     return np.asarray(np.arange(math.ceil(reach / width) + 1) * width)

@@ -61,16 +61,6 @@ LARGEST_SKEW = 0.3
 LARGEST_ERROR = 0.5
 """Relative error from which a diameter says nothing."""
 
-_POWER, _POWER_SIGMA = 3.0, 1.0  # prior of p: that of small spheres
-_LEAST_POWER = 1e-3  # its sign makes no difference below
-
-_TURNS = 4
-_LEAST_PRIOR = 0.25  # of the variance of an error: a population that is narrower tells nothing else
-_LEAST_TOLD = 0.05  # of the information of an error
-_NODES = np.linspace(-6.0, 6.0, 61)  # standard deviations
-
-_MARGIN = 3.0  # standard deviations of a curve beyond the outermost diameters
-
 
 @dataclass(frozen=True, eq=False)
 class Sizes:
@@ -125,7 +115,8 @@ def describe_sizes(
     events = Events(np.log(diameter / UNIT_NM), sigma / diameter, None, plain=True)
     measured, choice = events, Searched()
     best = choice.choose(events).best
-    for _ in range(_TURNS):
+    # turns of population and distributions
+    for _ in range(4):
         events = _beside(measured, power, best)
         found = choice.choose(events)
         best = found.best
@@ -175,26 +166,30 @@ def _power(diameter: FloatArray, sigma: FloatArray) -> float:
     slope = float(x @ y / (x @ x))
     left = float(np.mean((y - slope * x) ** 2))
     information = float(x @ x) / max(left, 1e-12)
-    prior = 1 / _POWER_SIGMA**2
-    found = (prior * _POWER - information * slope) / (prior + information)
-    return math.copysign(max(abs(found), _LEAST_POWER), found)
+    # the prior of p is that of small spheres, 3 ± 1
+    found = (3.0 - information * slope) / (1.0 + information)
+    # below it the sign of p makes no difference
+    return math.copysign(max(abs(found), 1e-3), found)
 
 
 def _beside(measured: Events, power: float, population: Mixture) -> Events:
     """Give the normal distributions that stand for the likelihoods beside a population."""
     own = np.argmax(population.shares(measured), axis=1)
     centre, error = population.mean[own], measured.sigma
-    variance = np.maximum(population.variance[own], _LEAST_PRIOR * measured.variance)
+    # of the variance of an error: a population that is narrower tells nothing else
+    variance = np.maximum(population.variance[own], 0.25 * measured.variance)
     total = 1 / variance + 1 / measured.variance
     middle = (centre / variance + measured.x / measured.variance) / total
-    x = middle + np.outer(_NODES, 1 / np.sqrt(total))
+    # standard deviations
+    x = middle + np.outer(np.linspace(-6.0, 6.0, 61), 1 / np.sqrt(total))
     misfit = np.expm1(power * (x - measured.x)) / (power * error)
     height = -0.5 * (misfit**2 + (x - centre) ** 2 / variance)
     weight = np.exp(height - height.max(axis=0))
     weight /= weight.sum(axis=0)
     mean = (weight * x).sum(axis=0)
     spread = (weight * (x - mean) ** 2).sum(axis=0)
-    information = np.maximum(1 / spread - 1 / variance, _LEAST_TOLD / measured.variance)
+    # of the information of an error, at least
+    information = np.maximum(1 / spread - 1 / variance, 0.05 / measured.variance)
     return Events(
         (mean / spread - centre / variance) / information, information**-0.5, None, plain=True
     )
@@ -202,7 +197,8 @@ def _beside(measured: Events, power: float, population: Mixture) -> Events:
 
 def _curve(events: Events, best: Mixture) -> pd.DataFrame:
     """Give the density per nm that the populations and the errors make."""
-    reach = _MARGIN * float(np.median(events.sigma))
+    # standard deviations of the curve beyond the outermost diameters
+    reach = 3.0 * float(np.median(events.sigma))
     ends = np.exp([events.x.min() - reach, events.x.max() + reach])
     diameter = np.linspace(ends[0], ends[1], POINTS)
     density = events.x.size * mean_density(events, best, np.log(diameter)) / diameter

@@ -40,10 +40,6 @@ from iscat_analysis.records import FloatArray
 LEAST_POSITIONS = 4
 """A shorter track says too little: of its displacements, at least one must have two neighbours."""
 
-_RATES_HZ = (1e-6, 1e9)
-_LENGTHS_NM = (1e-6, 1e9)  # the smallest error and the largest place
-_MOST_RATIO = 1e5  # of the errors of a track; their squares must not drown in one another
-_MOST_FRAMES = 2**53  # beyond, not every frame has a number of its own
 _ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this share
 
 
@@ -135,7 +131,8 @@ def gather(
 
     Shapes: `frames` (n,), `positions_nm` (n,) or (n, c).
     """
-    (slowest, fastest), (least, most) = _RATES_HZ, _LENGTHS_NM
+    # frame rates; the smallest error and the largest place
+    (slowest, fastest), (least, most) = (1e-6, 1e9), (1e-6, 1e9)
     rate = number_in(
         "frame_rate_hz", frame_rate_hz, least=slowest, most=fastest,
         what="number of frames per second",
@@ -149,7 +146,8 @@ def gather(
             f"frame to frame at frame_rate_hz = {frame_rate_hz:g}: correct one of them"
         )
     when = real_array("frames", frames)
-    listed = when.ndim == 1 and when.size >= LEAST_POSITIONS and np.abs(when).max() < _MOST_FRAMES
+    # beyond 2⁵³ not every frame has a number of its own
+    listed = when.ndim == 1 and when.size >= LEAST_POSITIONS and np.abs(when).max() < 2**53
     if not listed or (when % 1).any() or not (np.diff(when) > 0).all():
         raise DataError(
             f"frames: give the frame number of each of at least {LEAST_POSITIONS} positions, whole "
@@ -179,7 +177,8 @@ def gather(
                 f"{name} = {array[wrong].flat[0]:g}: give {what} in nanometres, between {low:g} "
                 f"and {most:g}; leave frames without one out"
             )
-    if columns.max() > _MOST_RATIO * columns.min():
+    # of the errors of a track, whose squares must not drown in one another
+    if columns.max() > 1e5 * columns.min():
         raise DataError(
             f"sigma_nm: goes from {columns.min():g} to {columns.max():g} nm; leave out positions "
             "that say nothing beside the others"

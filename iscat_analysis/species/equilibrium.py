@@ -77,8 +77,6 @@ COMPOSITION: dict[Model, FloatArray] = {
 }
 """How many of each part a species holds, (species, parts); the last species is the complex."""
 
-_LEAST = 1e-12  # of the total: what is absent has some logarithm
-
 
 def at_equilibrium(
     model: Model, totals_nm: FloatArray, kd_nm: float, inactive: float = 0.0
@@ -97,7 +95,8 @@ def at_equilibrium(
         s = active + other + kd_nm
         product = 2 * active * other / (s + np.sqrt(s**2 - 4 * active * other))
         found = [active - product + idle, other - product, product]
-    least = _LEAST * totals_nm.sum(axis=1)[:, None]
+    # of the total: what is absent has some logarithm
+    least = 1e-12 * totals_nm.sum(axis=1)[:, None]
     return np.asarray(np.maximum(np.array(found).T, least))
 
 
@@ -119,14 +118,9 @@ def landing_logits(
 
 
 _REACH = math.log(1e4)  # of ln K_D beyond the concentrations
-_GRID, _POWERS = 25, 9  # of ln K_D and of the exponent: where a start is sought
 _TURNED = 0.6  # of a peak's width: tails from which other maxima are sought
-_HIGHER = 1e-3  # of log-likelihood: another maximum than the one that was found
 _SAME = 1e-4  # of log-likelihood: two ways to one maximum
-_FIRST_STEP = 0.1  # of ln K_D towards an end of its interval
-_PROFILE = 9  # points of the profile between the ends of the interval
 _STEP = 1e-4  # of ln K_D and of β, for their slopes
-_MOST_INACTIVE = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +231,7 @@ class _Equilibrium:
         if power is None:
             added.append(("power", -1.0, 1.0, LANDING_POWER, LANDING_POWER_SIGMA))
         if inactive:
-            added.append(("inactive", 0.0, _MOST_INACTIVE, 0.05, 0.1))
+            added.append(("inactive", 0.0, 0.9, 0.05, 0.1))
         self.names, *numbers = zip(*added, strict=True)
         self.at = series.own
         of_series = np.array([series.low, series.high, series.first, series.scale])
@@ -299,9 +293,10 @@ class _Equilibrium:
         where the equilibrium is another, a large K_D with an exponent far from the usual one is.
         """
         logits, first = free.theta[self.at :], self.first[self.at :]
-        axes = [np.linspace(self.low[self.at], self.high[self.at], _GRID)[1:-1]]
+        # points of ln K_D and of the exponent where a start is sought
+        axes = [np.linspace(self.low[self.at], self.high[self.at], 25)[1:-1]]
         if self.power is None:
-            axes.append(np.linspace(self.low[self.at + 1], self.high[self.at + 1], _POWERS)[1:-1])
+            axes.append(np.linspace(self.low[self.at + 1], self.high[self.at + 1], 9)[1:-1])
         starts = [np.append(one, first[len(axes) :]) for one in product(*axes)]
         far = [np.sum(np.abs(self._logits(one) - logits)) for one in starts]
         begin = np.append(free.theta[: self.at], starts[int(np.argmin(far))])
@@ -332,7 +327,8 @@ def _profiled(
     """
     while True:
         interval_of_kd, reached = _interval(equilibrium, maxima)
-        if reached.value < maxima[0].value + _HIGHER:
+        # of log-likelihood: another maximum than the one that was found
+        if reached.value < maxima[0].value + 1e-3:
             return maxima[0], interval_of_kd
         maxima = [maximise(equilibrium.problem(), reached.theta), *maxima]
 
@@ -367,8 +363,10 @@ def _interval(
         return 2 * max(found.value - max(one.value for one in climbed.values()), 0.0)
 
     first = TWO_SIDED_95 * float(found.errors()[at])
-    low, high = interval(deviance, best, least, most, step=max(first, _FIRST_STEP))
-    grid = np.unique(np.append(np.linspace(low, high, _PROFILE), best))
+    # of ln K_D towards an end of its interval, at first
+    low, high = interval(deviance, best, least, most, step=max(first, 0.1))
+    # points of the profile between the ends of the interval
+    grid = np.unique(np.append(np.linspace(low, high, 9), best))
     points = np.column_stack([grid, [deviance(float(value)) for value in grid]])
     reached = max((one for branch in branches for one in branch.values()), key=lambda m: m.value)
     ends = math.exp(low) if low > least else 0.0, math.exp(high) if high < most else math.inf

@@ -16,8 +16,6 @@ POSSIBLE_KDA = (1e-6, 1e9)
 """Masses of particles, and errors of them, that a light microscope can tell of: a proton has 1e-3,
 a protein as large as the wavelength 1e8.  Their squares, and ratios of these, are numbers."""
 
-_SHARPEST = 1e-6  # of a limit: its softness
-
 
 def possible(mass_kda: FloatArray, sigma_kda: FloatArray) -> BoolArray:
     """Tell which events have a possible mass and a possible error.
@@ -72,7 +70,8 @@ class Edge(Efficiency):
     @classmethod
     def at(cls, limit_kda: float, softness_kda: float) -> Edge:
         """Half of what is measured at the limit is seen."""
-        spread = max(softness_kda, _SHARPEST * limit_kda)
+        # the least softness of a limit, over the limit
+        spread = max(softness_kda, 1e-6 * limit_kda)
         return cls(limit_kda / spread, spread, softness_kda=spread)
 
     def extra_sigma(self, sigma: FloatArray) -> FloatArray:

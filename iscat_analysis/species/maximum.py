@@ -30,12 +30,7 @@ from iminuit.warnings import IMinuitWarning
 
 from iscat_analysis.records import BoolArray, FloatArray
 
-_FAST = 0  # strategy of Minuit that takes no further second derivatives
-_SILENT = -1  # it would print where a start is no maximum, which is no news
 _TOLERANCE = 0.01  # of Minuit: 1e-5 of a log-likelihood
-_INSIDE = 1e-3  # of its range that a start lies away from a limit, where Minuit sees no slope
-_AT_LIMIT = 1e-4  # of its range from a limit
-_LEAST_BEND = 1e-8  # of the largest curvature, in units of the scale
 _DIFFERENCE = 1e-3  # of about a standard error: steps for second derivatives
 _STEP = 0.02  # of the scale: the first step where second derivatives say nothing
 
@@ -114,7 +109,8 @@ def maximise(problem: Problem, start: FloatArray, near: FloatArray | None = None
         return _positive(curvature(theta), problem.scale)
 
     reach = problem.high - problem.low
-    inside = _INSIDE * reach
+    # of its range that a start lies away from a limit, where Minuit sees no slope
+    inside = 1e-3 * reach
     with catch_warnings():
         # Minuit says that it needs no diagonal, and calls for one where the matrix is a saddle's.
         simplefilter("ignore", IMinuitWarning)
@@ -125,14 +121,17 @@ def maximise(problem: Problem, start: FloatArray, near: FloatArray | None = None
             hessian=as_of_maximum,
             g2=lambda theta: np.diag(as_of_maximum(theta)).copy(),
         )
-    search.errordef, search.strategy, search.tol = Minuit.LIKELIHOOD, _FAST, _TOLERANCE
+    # strategy 0 of Minuit takes no further second derivatives
+    search.errordef, search.strategy, search.tol = Minuit.LIKELIHOOD, 0, _TOLERANCE
     search.errors = _STEP * problem.scale
-    search.print_level = _SILENT
+    # it would print where a start is no maximum, which is no news
+    search.print_level = -1
     search.limits = list(zip(problem.low, problem.high, strict=True))
     search.fixed = problem.low == problem.high
     search.migrad()
     theta = np.array(search.values)
-    edge = _AT_LIMIT * reach
+    # of its range within which a parameter is at a limit
+    edge = 1e-4 * reach
     lowest, highest = theta <= problem.low + edge, theta >= problem.high - edge
     theta = np.where(lowest, problem.low, np.where(highest, problem.high, theta))
     free = ~(lowest | highest)
@@ -148,7 +147,8 @@ def _positive(curvature: FloatArray, scale: FloatArray) -> FloatArray:
     values, vectors = np.linalg.eigh(curvature * unit)
     if values[0] > 0:
         return curvature
-    least = _LEAST_BEND * np.abs(values).max()
+    # of the largest curvature, in units of the scale
+    least = 1e-8 * np.abs(values).max()
     return np.asarray((vectors * np.maximum(np.abs(values), least)) @ vectors.T / unit)
 
 
@@ -157,8 +157,6 @@ ENDS_95 = (0.025, 0.975)
 
 TWO_SIDED_95 = 1.959964
 """Standard errors from an estimate to an end of its 95 % interval."""
-
-_END_TOLERANCE = 1e-5  # of the parameter
 
 
 def interval(
@@ -180,6 +178,7 @@ def interval(
                 return limit
             inner, outer = outer, min(max(best + reach, low), high)
             reach *= 2
-        return float(scipy.optimize.brentq(beyond, inner, outer, xtol=_END_TOLERANCE))
+        # tolerance of the parameter at an end
+        return float(scipy.optimize.brentq(beyond, inner, outer, xtol=1e-5))
 
     return end(low), end(high)

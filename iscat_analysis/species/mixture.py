@@ -149,7 +149,6 @@ class Mixture:
 
 _OCTAVE = math.log(2.0)
 _OVERLAP = 0.65  # of the distance between neighbours: with it their sum has no bumps
-_BELOW_LIMIT = 0.3  # of the limit of detection, where nothing is seen of it
 
 
 def broad(events: Events) -> tuple[FloatArray, FloatArray]:
@@ -159,7 +158,8 @@ def broad(events: Events) -> tuple[FloatArray, FloatArray]:
     """
     low, high = float(events.x.min()), float(events.x.max())
     if events.efficiency is not None:
-        low = min(max(low, _BELOW_LIMIT * events.efficiency.threshold_kda), high)
+        # of the limit of detection, where nothing is seen of it
+        low = min(max(low, 0.3 * events.efficiency.threshold_kda), high)
     octaves = math.log(high / low) / _OCTAVE
     if octaves < 1:
         mean = np.array([(low + high) / 2])

@@ -37,12 +37,8 @@ from iscat_analysis.species.diffusion import NM2_PER_UM2, Displacements, bands, 
 STRETCH = 40
 """Displacements at least of a stretch of a track whose D is compared with that of the others."""
 
-_MOST_STRETCHES = 25
 MOST_POSITIONS = 4000
 """Of a track whose exponent is tested."""
-
-_LARGEST_STIFFNESS = 3.0  # times the frame rate: there a well is flat noise within one frame
-_LEAST_STIFFNESS = 0.3  # per length of the track: there a well is not felt
 
 
 @dataclass(frozen=True)
@@ -153,15 +149,13 @@ def exponent_of(track: Displacements) -> AnomalousTest:
     """Test whether the exponent of a track that is checked is 1."""
     if not track.best_nm2_s > 0:
         return AnomalousTest(1.0, 0.0, math.nan, math.nan, 0.0)
-    found = most_likely_power(track, track.best_nm2_s)
-    ratio = max(2 * (found.value - track.best.value), 0.0)
-    return AnomalousTest(
-        p_value=float(chdtrc(1, ratio)),
-        ratio=ratio,
-        exponent=found.exponent,
-        sigma_exponent=found.sigma_exponent,
-        d_um2_s=found.d_nm2_s / NM2_PER_UM2,
-    )
+    at, there = most_likely_power(track, track.best_nm2_s)
+    ratio = max(2 * (there.value - track.best.value), 0.0)
+    sigma = math.nan
+    if math.isfinite(there.value):
+        sigma = math.sqrt(float(np.linalg.inv(there.information)[1, 1]))
+    d_um2_s = math.exp(at[0]) / NM2_PER_UM2
+    return AnomalousTest(float(chdtrc(1, ratio)), ratio, float(at[1]), sigma, d_um2_s)
 
 
 def confinement_test(
@@ -257,7 +251,8 @@ def steadiness_of(track: Displacements) -> float:
     stretches (S. S. Wilks, Ann. Math. Stat. 9, 60, 1938).
     """
     last = track.frames.size - 1
-    count = min(last // STRETCH, _MOST_STRETCHES)
+    # stretches at most
+    count = min(last // STRETCH, 25)
     if count < 2:
         return 1.0
     ratio = 0.0
@@ -283,8 +278,10 @@ def _harmonic_trap(track: Displacements) -> tuple[float, float, float]:
     """Find the well of highest likelihood: the ratio, D [nm²/s] and κ [1/s]."""
     timed = track.positions_nm, track.variance_nm2, track.gaps_s, track.exposure_s
     scale = track.best_nm2_s or float(np.mean(track.steps_nm**2 / track.rate[0]))
-    softest = _LEAST_STIFFNESS / float(track.gaps_s.sum())
-    stiffest = _LARGEST_STIFFNESS / track.interval_s
+    # per length of the track: there a well is not felt
+    softest = 0.3 / float(track.gaps_s.sum())
+    # times the frame rate: there a well is flat noise within one frame
+    stiffest = 3.0 / track.interval_s
     value, d, stiffness = most_likely_well(timed, scale, softest, stiffest)
     return max(2 * (value - track.best.value), 0.0), d, stiffness
 
@@ -307,22 +304,9 @@ def free_track(track: Displacements, d: float, rng: np.random.Generator) -> Disp
 
 _EXPONENTS = (0.02, 1.98)
 _LN_D = 20.0  # from ln D of free diffusion at most
-# An exposure this small a part of a lag blurs by a series; the closed form cancels
-_SHORT_EXPOSURE = 1e-2
 _EXPONENT_STEP = 1e-3  # of an exponent, for the derivatives of the mean-squared displacement
 _SETTLED = 1e-3  # twice the gain of log-likelihood that a last step expects
-_NO_STEP = 1e-6  # of ln D and α
 _MOST_STEPS = 50
-_MOST_ROWS_DIRECT = 80  # rows of a matrix that is not halved to be inverted
-
-
-class Fractional(NamedTuple):
-    """Fractional Brownian motion of highest likelihood."""
-
-    value: float
-    d_nm2_s: float
-    exponent: float
-    sigma_exponent: float
 
 
 class _There(NamedTuple):
@@ -351,14 +335,17 @@ class Lags(NamedTuple):
         return cls(distinct.astype(float), which.reshape(pairs.shape))
 
 
-def most_likely_power(track: Displacements, free: float) -> Fractional:
-    """Maximise the likelihood of D and α by Newton's method, within limits."""
+def most_likely_power(track: Displacements, free: float) -> tuple[FloatArray, _There]:
+    """Maximise the likelihood of D and α by Newton's method, within limits; (ln D, α) and it.
+
+    Shapes: result (2,).
+    """
     lags = Lags.of(track)
     at = np.array([math.log(free), 1.0])
     low, high = np.array([at[0] - _LN_D, _EXPONENTS[0]]), np.array([at[0] + _LN_D, _EXPONENTS[1]])
     here = likelihood_at(track, lags, at)
     if not math.isfinite(here.value):
-        return Fractional(here.value, free, 1.0, math.nan)
+        return at, here
     for _ in range(_MOST_STEPS):
         known = here.curvature
         if not (known[1, 1] > 0 and np.linalg.det(known) > 0):
@@ -370,14 +357,14 @@ def most_likely_power(track: Displacements, free: float) -> Fractional:
             at = at + step
             break
         there = likelihood_at(track, lags, at + step)
-        while not there.value > here.value and np.abs(step).max() > _NO_STEP:
+        # of ln D and α: no step at all
+        while not there.value > here.value and np.abs(step).max() > 1e-6:
             step /= 2
             there = likelihood_at(track, lags, at + step)
         if not there.value > here.value:  # rounding is all that is left
             break
         at, here = at + step, there
-    sigma = math.sqrt(float(np.linalg.inv(here.information)[1, 1]))
-    return Fractional(here.value, math.exp(at[0]), float(at[1]), sigma)
+    return at, here
 
 
 def likelihood_at(track: Displacements, lags: Lags, at: FloatArray) -> _There:
@@ -416,7 +403,8 @@ def likelihood_at(track: Displacements, lags: Lags, at: FloatArray) -> _There:
 def _inverse(sigma: FloatArray) -> tuple[FloatArray, float]:
     """Invert a covariance by halves, twice as fast as LAPACK, with its log-determinant."""
     half = len(sigma) // 2
-    if 2 * half <= _MOST_ROWS_DIRECT:
+    # rows of a matrix that is not halved to be inverted
+    if 2 * half <= 80:
         factor = np.linalg.cholesky(sigma)
         return np.asarray(np.linalg.inv(sigma)), 2 * float(np.log(np.diag(factor)).sum())
     first, one = _inverse(sigma[:half, :half])
@@ -439,7 +427,8 @@ def mean_squared_displacement(
         high = exponent + 2
         closed = (lags + e) ** high + np.abs(lags - e) ** high - 2 * lags**high
         closed /= e**2 * (exponent + 1) * high
-        far = lags * _SHORT_EXPOSURE > e
+        # An exposure this small a part of a lag blurs by a series; the closed form cancels
+        far = lags * 1e-2 > e
         series = 1 + exponent * (exponent - 1) / 12 * (e / np.where(far, lags, 1.0)) ** 2
         smooth = np.where(far, smooth * series, closed)
     return np.asarray(2 * track.interval_s * (smooth - smooth[0]))

@@ -46,12 +46,7 @@ from iscat_analysis.species.structure import (
 _STEP = 0.25  # of the places: as fine as the likelihood of hundreds of events tells
 _PLACES = np.arange(-2.5, 1.51, _STEP)  # of T from the peak, in widths
 _SOFT = (0.0, 0.3, 0.6, 1.0)  # r in widths; the first are as sharp as a cut
-_HOPELESS = 12.0  # log-likelihood below the highest, beyond which a limit is not moved on
 _FAR = 0.35  # prior: that T lies below all of these, where it makes no difference
-_LOWEST = 10  # events that tell how far below the lightest a cut may be
-_JUST_BELOW = 1e-9  # of the lightest event
-_BETTER = 0.1  # of BIC: other species, and not the same found again
-_LEAST = 1e-3  # probability of a limit that is kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +74,8 @@ def with_edges(
         return found, possible
     again = choice.choose(possible[0].events)
     n = events.x.size
-    if again.best.bic(n) > possible[0].mixture.bic(n) - _BETTER:
+    # of BIC: other species, and not the same found again
+    if again.best.bic(n) > possible[0].mixture.bic(n) - 0.1:
         return found, possible
     return again, possible_edges(events, again, least)
 
@@ -95,7 +91,8 @@ def possible_edges(events: Events, found: Chosen, least: float) -> list[Possible
     first = int(light[np.argmin(best.means()[light])]) if light.size else 0
     middle = float(best.means()[first])
     width = math.hypot(float(best.widths()[first]), math.sqrt(events.usual_variance))
-    lowest = np.sort(events.x)[:_LOWEST]
+    # events that tell how far below the lightest a cut may be
+    lowest = np.sort(events.x)[:10]
     gap = float(np.ptp(lowest)) / max(lowest.size - 1, 1)
     tried = [Possible(math.log(_FAR) + best.log_likelihood, events, best, found.structure)]
     near = tried[0].curvature
@@ -109,7 +106,8 @@ def possible_edges(events: Events, found: Chosen, least: float) -> list[Possible
         return prior + fit.log_likelihood, fit
 
     if gap > 0:
-        at(float(lowest[0]) * (1 - _JUST_BELOW), 0.0, min(gap / (_STEP * width), 1.0), best)
+        # just below the lightest event
+        at(float(lowest[0]) * (1 - 1e-9), 0.0, min(gap / (_STEP * width), 1.0), best)
     highest = max(one.probability for one in tried)
     for soft in _SOFT:
         fit, last = best, -math.inf
@@ -118,11 +116,13 @@ def possible_edges(events: Events, found: Chosen, least: float) -> list[Possible
                 continue
             value, fit = at(limit, soft * width, 1.0, fit)
             highest = max(highest, value)
-            if value < min(highest - _HOPELESS, last):
+            # log-likelihood below the highest, beyond which a limit is not moved on
+            if value < min(highest - 12.0, last):
                 break
             last = value
     chance: FloatArray = softmax([one.probability for one in tried])  # of their logarithms
-    kept = [i for i in np.argsort(-chance, kind="stable") if chance[i] > _LEAST]
+    # probability of a limit that is kept
+    kept = [i for i in np.argsort(-chance, kind="stable") if chance[i] > 1e-3]
     total = chance[kept].sum()
     return [replace(tried[i], probability=float(chance[i] / total)) for i in kept]
 
@@ -145,10 +145,6 @@ def ratio_of_doubt(possible: list[Possible]) -> FloatArray:
             low, high = column[order][np.minimum(ends, column.size - 1)]
             ratios[number] = min(ratios[number], high / max(low, 1e-300))
     return ratios
-
-
-_SUPPORT_DRAWS = 20
-_RIVAL_STEPS = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +179,8 @@ def bootstrap(
                 fit, fit.shares(drawn).sum(axis=0), fit.came * fit.arrived(drawn), peaks(drawn, fit)
             )
         )
-        if found.searched and number < _SUPPORT_DRAWS:
+        # repetitions in which other numbers are tried
+        if found.searched and number < 20:
             n = drawn.x.size
             agreed.append(
                 all(fit.bic(n) <= rival.bic(n) for rival in _rivals(drawn, fit.by_mass()))
@@ -219,7 +216,7 @@ def draw_events(events: Events, mixture: Mixture, n: int, rng: np.random.Generat
 
 def _rivals(events: Events, fit: Mixture) -> list[Mixture]:
     """Fit one species more and, where there are two or more, one less."""
-    more = [ascend(events, start, _RIVAL_STEPS) for start in split_starts(events, fit)]
+    more = [ascend(events, start, 10) for start in split_starts(events, fit)]
     return [
         polish(events, max(starts, key=partial(height, events)))
         for starts in (more, joined_starts(fit))

@@ -46,25 +46,10 @@ from iscat_analysis.species.structure import LOGIT_REACH, WIDTH_STEP, width_prio
 
 _MASS_RANGE = 0.2  # of the masses that were given
 _OFFSET = 0.05  # of the lightest mass
-# Of the lightest, times the root of the mass over its: standard deviation of a species
-_WIDEST = 0.35
-_LONGEST, _FIRST_TAIL = 2.0, 0.2  # of a peak's width: a tail
 _CUTS = (0.0, 0.5, 1.2, 2.3, np.inf)  # of an exponential of mean 1: its parts are nearly normal
-_OVERLAP = 0.5  # width of a part of the background over the distance to its neighbours
-# Of a peak's width: a tail; less, and a tail of one width is taken for a limit
-_TAIL_SPREAD = 1.5
-_SLOPE_SPREAD = 0.7  # of the logarithm of the background's density over the window
-# Of the same between its middles, away from the line between their neighbours
-_BEND_SPREAD = 0.15
-_FIRST_BACKGROUND, _BACKGROUND = -6.0, 3.0  # logit of its share: of the series
-_SHARE_SPREAD = 0.7  # of one table about that
+_FIRST_BACKGROUND = -6.0  # logit of its share: of the series
 _SOFT, _SOFTNESS = 0.6, 0.3  # of a peak's width: spread of the limit of detection
-# Of the lightest mass: where the limit may lie about the lower end of the events
-_LIMIT_SPREAD = 0.5
-_EDGE_QUANTILE = 0.02  # quantile of the events where their edge is sought
-_ABOVE_RISE = 3.0  # of a peak's width: how far above that edge the limit may lie
 _NODES = 64
-_PEAK_REACH = 0.4  # of the lightest mass: events of a peak
 _TINY = 1e-290
 
 
@@ -157,15 +142,20 @@ class Series:
         parts.append((-0.3 * lightest, 0.3 * lightest, 0.0, self.width))
         narrowest, log_width = math.log(self.noise) / 2, math.log(self.width)
         for mass in self.masses:
-            widest = max(_WIDEST * math.sqrt(lightest * mass), 2 * math.sqrt(self.noise))
+            # of the lightest mass, times the root of the mass over its: standard deviation of a
+            # species
+            widest = max(0.35 * math.sqrt(lightest * mass), 2 * math.sqrt(self.noise))
             parts.append((narrowest, math.log(widest), log_width, WIDTH_STEP))
-        parts.append((-_LONGEST, _LONGEST, _FIRST_TAIL, 1.0))
+        # of a peak's width: a tail, at most and at first
+        parts.append((-2.0, 2.0, 0.2, 1.0))
         self.tail = len(parts) - 1
         parts += [(-LOGIT_REACH, LOGIT_REACH, 0.0, 1.0)] * (self.knots.size - 1)
         if self.learned:
             edge = np.concatenate([t.x for t in self.tables if t.learned])
-            rise = float(np.quantile(edge, _EDGE_QUANTILE)) if edge.size else self.ends[0]
-            highest = max(1.3 * lightest, rise + _ABOVE_RISE * self.width)
+            # quantile of the events where their edge is sought
+            rise = float(np.quantile(edge, 0.02)) if edge.size else self.ends[0]
+            # of a peak's width: how far above that edge the limit may lie
+            highest = max(1.3 * lightest, rise + 3.0 * self.width)
             parts.append((self.ends[0] - 3 * self.width, highest, rise, self.width))
             parts.append((0.25 * self.width, 1.6 * self.width, _SOFT * self.width, self.width))
         self.shares = len(parts)
@@ -183,7 +173,8 @@ class Series:
         lightest = float(self.masses.min())
         found = []
         for mass in self.masses:
-            near = x[np.abs(x - mass) < _PEAK_REACH * lightest]
+            # of the lightest mass: events of a peak
+            near = x[np.abs(x - mass) < 0.4 * lightest]
             if near.size > 0.05 * x.size:
                 found.append(SIGMA_PER_MAD * float(np.median(np.abs(near - np.median(near)))))
         return min(max(min(found, default=0.12 * lightest), 0.02 * lightest), 0.3 * lightest)
@@ -208,7 +199,8 @@ class Series:
         step = np.diff(self.knots)
         mean = np.concatenate([[self.knots[0] - step[0]], self.knots, [self.knots[-1] + step[-1]]])
         gaps = np.concatenate([[step[0]], step, [step[-1]]])
-        width = _OVERLAP * (np.append(gaps[0], gaps) + np.append(gaps, gaps[-1])) / 2
+        # width of a part over the distance to its neighbours
+        width = 0.5 * (np.append(gaps[0], gaps) + np.append(gaps, gaps[-1])) / 2
         low, high = self.ends
         inside = ndtr((high - mean) / width) - ndtr((low - mean) / width)
         middles = np.eye(self.knots.size)
@@ -234,18 +226,23 @@ class Series:
         one, place, lightest = np.eye(self.own), self.parts, float(self.masses.min())
         bends = slice(self.tail + 1, self.tail + self.knots.size)
         shape = np.vstack([np.zeros(self.own), one[bends]])  # the first knot's logarithm is 0
-        rows = [one[place] / (_OFFSET * lightest), one[self.tail] / _TAIL_SPREAD]
-        rows += [shape[-1] / _SLOPE_SPREAD]
-        rows += list((shape[1:-1] - (shape[:-2] + shape[2:]) / 2) / _BEND_SPREAD)
+        # of a peak's width: a tail; less, and a tail of one width is taken for a limit
+        rows = [one[place] / (_OFFSET * lightest), one[self.tail] / 1.5]
+        # of the logarithm of the background's density over the window
+        rows += [shape[-1] / 0.7]
+        # of the same between its middles, away from the line between their neighbours
+        rows += list((shape[1:-1] - (shape[:-2] + shape[2:]) / 2) / 0.15)
         middle = [0.0] * len(rows)
         if self.learned:
-            at, spread = self.shares - 2, _LIMIT_SPREAD * lightest
+            # of the lightest mass: where the limit may lie about the lower end of the events
+            at, spread = self.shares - 2, 0.5 * lightest
             rows += [one[at] / spread, one[at + 1] / (_SOFTNESS * self.width)]
             middle += [float(self.first[at]) / spread, _SOFT / _SOFTNESS]
         widths, usual = width_prior(self.masses)
         # Shares of background scatter about a level that they have in common.
-        covariance = np.full((self.number, self.number), _BACKGROUND**2)
-        covariance += _SHARE_SPREAD**2 * np.eye(self.number)
+        # logit of the background's share: of the series, and of one table about that
+        covariance = np.full((self.number, self.number), 3.0**2)
+        covariance += 0.7**2 * np.eye(self.number)
         apart = np.linalg.inv(np.linalg.cholesky(covariance))
         self.prior_design = np.vstack(
             [*rows, widths @ one[place + 1 : self.tail], apart @ one[self.shares :]]

@@ -143,7 +143,8 @@ def parameters(samples: Samples, mixtures: Sequence[Mixture]) -> FloatArray:
     """
     rows, values = [], []
     for (events, structure), mixture in zip(samples, mixtures, strict=True):
-        logits = np.log(np.maximum(mixture.weight, _LEAST_WEIGHT))
+        # weight of a component that a sample lacks, at a start
+        logits = np.log(np.maximum(mixture.weight, 1e-6))
         width = np.log(mixture.variance + structure.noise) / 2
         value = np.array([logits - logits[0], mixture.mean, width]) - structure.origin
         size = math.sqrt(events.x.size)
@@ -236,7 +237,8 @@ def _lightest(events: Events, start: Mixture) -> float:
     if isinstance(events.efficiency, Edge):  # the errors may be unknown, and in the widths
         square += float(start.variance[: start.narrow].min())
     spread = math.sqrt(square)
-    return max(min(events.efficiency.threshold_kda + _HARDLY_SEEN * spread, seen), 0.0)
+    # standard deviations below the threshold, where 3 % are seen
+    return max(min(events.efficiency.threshold_kda - 1.88 * spread, seen), 0.0)
 
 
 def polish(events: Events, start: Mixture) -> Mixture:
@@ -259,12 +261,8 @@ def fit_jointly(
     )
 
 
-_HARDLY_SEEN = -1.88  # standard deviations above the threshold, where 3 % are seen
-_LEAST_WEIGHT = 1e-6  # of a component that a sample lacks, at a start
-
-_POWER, _POWER_SPREAD = 0.5, 0.5
+_POWER = 0.5
 _DEVIATION = 0.25  # of ln T
-_ANY = 100.0  # of a, in ln T: as good as flat
 
 
 def width_prior(mass: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -274,7 +272,8 @@ def width_prior(mass: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     away = np.log(np.maximum(mass, 1e-9))
     away = away - away.mean()
-    covariance = _DEVIATION**2 * np.eye(mass.size) + _ANY**2
-    covariance += _POWER_SPREAD**2 * np.outer(away, away)
+    # of a, in ln T: as good as flat
+    covariance = _DEVIATION**2 * np.eye(mass.size) + 100.0**2
+    covariance += 0.5**2 * np.outer(away, away)
     rows = np.linalg.inv(np.linalg.cholesky(covariance))
     return rows, rows @ (_POWER * away)

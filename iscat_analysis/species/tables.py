@@ -49,10 +49,6 @@ from iscat_analysis.units import count, listed
 UNKNOWN_SIGMA_KDA = 1.0
 """Error of an event whose table has none [kDa]."""
 
-_CLEAR_SIGMAS = 3.0  # standard deviations above the threshold, where hardly any is missed
-_LEAST_EXTRA = 0.05  # of σ_d: noise of the filter's estimate beyond that of the fit
-_FEWEST_EVENTS = 10  # events to measure σ_d by
-_NEAR_EDGE = 10  # values that tell where a distribution begins
 _CUT_WIDTH = 1e-6  # of a cut: its width
 # Of the lightest mass, and the heaviest over it, between which an event must lie
 _LEAST_MASS_RATIO = 0.5
@@ -215,8 +211,8 @@ def filter_efficiency(
         return None
     each = mass / snr
     # Near the threshold those are seen whose estimate is too large; they would make σ_d too small.
-    clear = mass > (threshold_snr + _CLEAR_SIGMAS) * float(np.median(each))
-    if np.count_nonzero(clear) >= _FEWEST_EVENTS:
+    clear = mass > (threshold_snr + 3.0) * float(np.median(each))
+    if np.count_nonzero(clear) >= 10:
         each = each[clear]
     elif "sigma_mass_kda" in good:
         sigma = good["sigma_mass_kda"].to_numpy(dtype=float)[known]
@@ -235,7 +231,8 @@ def _truncated(mass: FloatArray, snr: FloatArray, sigma: FloatArray, threshold_s
     middle = float(np.median(mass / snr)) if mass.size else math.nan
 
     def loss(scale: float) -> float:
-        extra = np.sqrt(np.maximum(scale**2 - sigma**2, (_LEAST_EXTRA * scale) ** 2))
+        # of σ_d: noise of the filter's estimate beyond that of the fit
+        extra = np.sqrt(np.maximum(scale**2 - sigma**2, (0.05 * scale) ** 2))
         off = (snr * scale - mass) / extra
         seen = log_ndtr((mass - threshold_snr * scale) / extra)
         return float(np.sum(0.5 * off**2 + np.log(extra / scale) + seen))
@@ -337,7 +334,8 @@ def _from_snr(table: pd.DataFrame, path: Path | None) -> Efficiency | None:
     """Estimate threshold and noise of the filter from a table of this program."""
     good = species_rows(table)[0] if "status" in table else table
     snr = good["snr"].to_numpy(dtype=float)
-    few = np.sort(snr[np.isfinite(snr) & (snr > 0)])[:_NEAR_EDGE]
+    # values that tell where the distribution begins
+    few = np.sort(snr[np.isfinite(snr) & (snr > 0)])[:10]
     if not few.size:
         return None
     # The smallest value, less the mean distance of values near it.

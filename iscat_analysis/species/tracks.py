@@ -99,8 +99,6 @@ from iscat_analysis.units import KILODALTON_KG, NM
 NO_PLACE = (Status.NOT_CONVERGED, Status.SIDELOBE, Status.TOO_CLOSE)
 """Of rows that do not say how a particle moves."""
 
-_LARGEST_ERROR_RATIO = 300.0  # times the median error: such a place says nothing
-
 
 @dataclass(frozen=True)
 class TrackRows:
@@ -150,7 +148,8 @@ class TrackRows:
         missing.
         """
         errors = np.fmax(self.sigma_x_nm, self.sigma_y_nm)
-        useful = errors <= _LARGEST_ERROR_RATIO * of_known(np.median, errors)
+        # times the median error: such a place says nothing
+        useful = errors <= 300.0 * of_known(np.median, errors)
         useful &= np.diff(self.frame, prepend=-1) > 0
         for status in NO_PLACE:
             useful &= self.status != status
@@ -207,10 +206,6 @@ def of_known(statistic: Callable[[FloatArray], Any], values: FloatArray) -> floa
     return float(statistic(known)) if known.size else np.nan
 
 
-_ROUNDS = 8  # of mass and weights in turn; each has an error (p σ/m)²/n of the one before
-_MASS_TOLERANCE = 1e-9  # of the mass
-
-
 @dataclass(frozen=True)
 class CommonMass:
     """The mass of a track, by the columns of ``tracks.csv``."""
@@ -250,10 +245,11 @@ def combine_masses(
         return np.asarray(decorrelated(1 / errors) / errors)
 
     mass = float(np.median(mass_kda))
-    for _ in range(_ROUNDS):
+    # rounds of mass and weights; each has an error (p σ/m)²/n of the one before
+    for _ in range(8):
         weights, before = weights_at(mass, sigma_kda), mass
         mass = float(weights @ mass_kda / weights.sum())
-        if abs(mass - before) <= _MASS_TOLERANCE * abs(mass):
+        if abs(mass - before) <= 1e-9 * abs(mass):
             break
     off = (mass_kda - mass) / (sigma_kda * np.abs(mass_kda / mass) ** (power / 2))
     inside, free = float(off @ decorrelated(off)), mass_kda.size - 1
@@ -283,10 +279,6 @@ def information_power(tracks: Sequence[tuple[FloatArray, FloatArray]]) -> float:
 
 
 _DEGREE = 2
-_FEWEST_TRACKS = 3
-# p-value below which a common change is reported, whichever two tracks are left out.
-_LARGEST_CHANCE = 1e-4
-_SUSPECTS = 12  # that change most by themselves; two of these are left out in turn
 
 
 def common_change(
@@ -308,13 +300,16 @@ def common_change(
         slopes = slopes - np.average(slopes, axis=0, weights=weight)
         information.append((slopes.T * weight) @ slopes)
         pull.append(slopes.T @ (weight * (mass / mean - 1)))
-    if len(pull) < _FEWEST_TRACKS:
+    # tracks without which no change is common
+    if len(pull) < 3:
         return 0.0
     pulls, known = np.array(pull), np.array(information)
     every, whole = pulls.sum(axis=0), known.sum(axis=0)
-    least = chdtri(_DEGREE, _LARGEST_CHANCE)
+    # p-value below which a common change is reported, whichever two tracks are left out
+    least = chdtri(_DEGREE, 1e-4)
     own = np.einsum("ni,nij,nj->n", pulls, np.linalg.pinv(known), pulls)
-    suspects = np.argsort(-own)[:_SUSPECTS].tolist()
+    # those that change most by themselves, of which two are left out in turn
+    suspects = np.argsort(-own)[:12].tolist()
     for left_out in (*combinations(range(len(pulls)), 1), *combinations(suspects, 2)):
         rest = every - pulls[[*left_out]].sum(axis=0)
         if rest @ np.linalg.pinv(whole - known[[*left_out]].sum(axis=0)) @ rest < least:
@@ -436,18 +431,10 @@ SURE_SIZE = 0.999
 """Posterior probability of an optical diameter below which it is flagged as ambiguous, and of
 another particle from which it is flagged as that."""
 
-_FIRST_LOOK, _FULL_LOOK = 19, 199  # resamples: few unless they leave doubt
-_MOST_DOUBTFUL_SHARE = 0.1
-_ENOUGH = 3  # of the first that are as surprising leave none
-_LEAST_KNOWN_SHARE = 0.05  # of the information on a mass is left by the background
-_LEAST_SEEN_SHARE = 0.9  # of all frames, in which a particle that hardly moves is seen at least
-# Relative error of a mass beyond which the error of D that it makes is reported.
-_LARGEST_SCALE_ERROR = 0.02
 # Errors of images alone, which are enlarged where the fits of a track are rejected.
 _OF_IMAGES = ("sigma_mass_kda", "sigma_optical_diameter_nm", "sigma_refractive_index")
 _FREE = ("p_confinement", "p_anomalous", "p_steady")
 _STEPS = 3.0  # standard deviations of a displacement within which it may end beyond the border
-_DISPLACEMENT_PASSES = 3  # at D, on which it depends which displacements tell it
 
 
 @dataclass(frozen=True)
@@ -496,8 +483,12 @@ def describe_tracks(
     exact = {} if masses is None else masses.to_dict("index")
     found = []
     for track, rows in groups.items():
-        good = massive[track]
-        mass = _mass(good, power, correlation) if len(good.frame) else None
+        good, mass = massive[track], None
+        if len(good.frame):
+            places = np.stack([good.x_nm, good.y_nm], axis=1)
+            among = None if correlation is None else correlation(places)
+            masses = good.mass_kda, good.sigma_mass_kda, good.crb_mass_kda
+            mass = combine_masses(*masses, power=power, correlation=among)
         wider = mass.enlargement if rows.rejected and mass is not None else 1.0
         placed = rows.placed().timed(setup.ticks).enlarged(wider)
         found.append(_Track(track, rows, placed, mass, wider, exact.get(track, {})))
@@ -555,7 +546,9 @@ class _Track:
         record |= known
         record |= {name: self.wider * record[name] for name in record if name in _OF_IMAGES}
         scale = _scale_error(record, known_share)
-        record["short_way"] = known_share < _LEAST_KNOWN_SHARE and scale > 2 * _LARGEST_SCALE_ERROR
+        # of the information on the mass the background leaves little, and what its error adds to
+        # that of D is seen
+        record["short_way"] = known_share < 0.05 and scale > 0.04
         massive = rows.only(rows.mass_kda != 0)  # a fit may end at nothing, and so is its contrast
         each = of_known(np.median, massive.contrast / massive.mass_kda)
         record["contrast"] = record["mass_kda"] * each
@@ -595,14 +588,6 @@ def _wider(found: Diffusion, end: int, scale: float) -> float:
     return best * math.exp(reach if end else -reach)
 
 
-def _mass(good: TrackRows, power: float, correlation: Correlation | None) -> CommonMass:
-    among = None
-    if correlation is not None:
-        among = correlation(np.stack([good.x_nm, good.y_nm], axis=1))
-    masses = good.mass_kda, good.sigma_mass_kda, good.crb_mass_kda
-    return combine_masses(*masses, power=power, correlation=among)
-
-
 def _diffusion(placed: TrackRows, setup: TrackSetup) -> tuple[Diffusion, Displacements] | None:
     """Fit D to displacements that begin so far inside that they cannot have left the field."""
     least = max(LEAST_POSITIONS, setup.min_frames)
@@ -612,7 +597,8 @@ def _diffusion(placed: TrackRows, setup: TrackSetup) -> tuple[Diffusion, Displac
         *placed.positions(), frame_rate_hz=setup.frame_rate_hz, exposure_ms=setup.exposure_ms
     )
     room, inside = _room(placed, setup)[:-1], whole.counted
-    for _ in range(_DISPLACEMENT_PASSES):
+    # at D, on which it depends which displacements tell it
+    for _ in range(3):
         counted = whole if inside is whole.counted else replace(whole, counted=inside)
         reach = _STEPS * np.sqrt(2 * counted.best_nm2_s * whole.gaps_s)
         inside = np.flatnonzero(room > reach)
@@ -683,9 +669,10 @@ def _motions(
 def _tests(whole: Displacements, rng: np.random.Generator) -> dict[str, float]:
     """Test whether the motion is free; two of the tests use the first positions of long tracks."""
     track = stretch_of(whole, slice(TESTED_POSITIONS))
-    walls = well_of(track, _FIRST_LOOK, _ENOUGH, rng)
-    if walls.p_value <= _MOST_DOUBTFUL_SHARE:
-        walls = well_of(track, _FULL_LOOK, None, rng)
+    # few resamples first; three that are as surprising leave no doubt
+    walls = well_of(track, 19, 3, rng)
+    if walls.p_value <= 0.1:
+        walls = well_of(track, 199, None, rng)
     power = exponent_of(track)
     return {
         "p_confinement": walls.p_value,
@@ -718,7 +705,8 @@ def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
 def _is_partly_seen(record: Mapping[str, Any], setup: TrackSetup) -> bool:
     """Whether a particle that hardly moves is detected in only a part of the movie."""
     frames = setup.frames[1] - setup.frames[0]
-    if setup.frame_rate_hz is None or record["n_frames"] > _LEAST_SEEN_SHARE * frames:
+    # of all frames, in which a particle that hardly moves is seen at least
+    if setup.frame_rate_hz is None or record["n_frames"] > 0.9 * frames:
         return False
     way_nm = math.sqrt(2 * NM2_PER_UM2 * abs(record["d_um2_s"]) * frames / setup.frame_rate_hz)
     return way_nm < setup.hidden_nm
