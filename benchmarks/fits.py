@@ -28,13 +28,7 @@ import numpy as np  # noqa: E402  # after the thread counts
 from _peer import peer_python  # noqa: E402
 
 from iscat_analysis.config import parse_config  # noqa: E402
-from iscat_analysis.inference.fit import (  # noqa: E402
-    compile_kernels,
-    fit_particle,
-    parts_of,
-    search_box,
-    start_theta,
-)
+from iscat_analysis.inference.fit import compile_kernels, fit_particle, search_box, start_theta  # noqa: E402
 from iscat_analysis.inference.likelihood import Likelihood  # noqa: E402
 from iscat_analysis.records import Box, Candidate, FloatArray  # noqa: E402
 from iscat_analysis.study import Setting, make_setting, trial_generator  # noqa: E402
@@ -114,7 +108,7 @@ class Batch:
 
     def __init__(self, side: int, count: int) -> None:
         self.setting = experiment(side)
-        compile_kernels(self.setting.context.model, parts_of(self.setting.free, posteriors=False))
+        compile_kernels(self.setting.context.model, heights="z_nm" in self.setting.free)
         pixel, truth = self.setting.context.pixel_nm, self.setting.truth
         self.sets: list[tuple[Likelihood, FloatArray, Box]] = []
         for i in range(count):

@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from scipy.signal import fftconvolve
 
 from iscat_analysis.config import Optics
-from iscat_analysis.pieces import compile_kernels, config_of, fit_particle, gather, parts_of, psf
+from iscat_analysis.pieces import compile_kernels, config_of, fit_particle, gather, psf
 from iscat_analysis.records import PARAMETERS, Candidate, FloatArray, Status
 from iscat_analysis.study import EstimatorSetup
 
@@ -50,7 +50,7 @@ def iscat(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> pd.Da
         config, before, after, n_before=setup.n_before, n_after=setup.n_after,
         power_ratio=setup.n_after / max(setup.n_before, 1), level=setup.level_fitted,
     )  # fmt: skip
-    compile_kernels(counts.model, parts_of(setup.free, posteriors=False))
+    compile_kernels(counts.model, heights="z_nm" in setup.free)
     pixel = setup.pixel_size_nm
     rows = np.full((len(before), 8), np.nan)
     for i, (x, y, z, mass) in enumerate(setup.start.tolist()):

@@ -324,8 +324,8 @@ class _Picture:
             one = expected_likelihood(model, grid, theta, light, frames, read_noise_e=read)
             places.append((one, theta))
             parts.append(eliminated(joint_information(one, theta, names)[fitted], count))
-        level = config.background.method == "sliding"
-        return cls(tuple(places), names, mass, level, np.asarray(np.mean(parts, axis=0)))
+        information = np.asarray(np.mean(parts, axis=0))
+        return cls(tuple(places), names, mass, config.background.slides, information)
 
     @property
     def snr(self) -> float:

@@ -51,8 +51,6 @@ from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, find_par
 MAX_ROUNDS = 8
 """Rounds of search; each takes the particles found so far off the image."""
 
-_SWEEPS = 2  # fits of everything with everything else in place, after the last round; at least
-
 
 def fit_field(
     context: AnalysisContext,
@@ -169,7 +167,8 @@ class FieldFit:
             last = _without_doubles(events, self._context)
             events = self.fit(last)
             self.refine_power(events)
-            if sweep + 1 >= _SWEEPS and _is_settled(last, events, self._context.roi_px / 2):
+            # at least two fits of everything with everything else in place
+            if sweep + 1 >= 2 and _is_settled(last, events, self._context.roi_px / 2):
                 break
         return events
 

@@ -36,7 +36,6 @@ SPAN = 2
 SLOPE_SPAN = 6
 """Windows before a step, and as many after it, within which pixels may change along a line."""
 
-_LOOKED_AT = 5  # turns at which slopes are compared with noise
 _MARGIN_PX = 8  # around a region, so that its own edges do not matter
 _REACH = SPAN * STRIDES
 
@@ -252,7 +251,8 @@ class MovingPattern:
         last, read = len(chunk.counts), chunk.camera.read_variance_e2(chunk.shape)
         counts = (chunk.blocks_e.sum(axis=0) + last * read) / self._still**2
         found = []
-        for turn in np.linspace(0, last, _LOOKED_AT + 2)[1:-1].round().astype(int).tolist():
+        # at five turns slopes are compared with noise
+        for turn in np.linspace(0, last, 7)[1:-1].round().astype(int).tolist():
             weights, information = self._least_squares(turn)
             if not information > 0:
                 continue

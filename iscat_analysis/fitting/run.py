@@ -30,10 +30,10 @@ from iscat_analysis.executors import Executor
 from iscat_analysis.files import whole_file
 from iscat_analysis.findings import Finding, Findings, existing
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.inference.fit import compile_kernels, parts_of
+from iscat_analysis.inference.fit import compile_kernels
 from iscat_analysis.inference.heights import has_prior
 from iscat_analysis.reading import npz_of, parquet_of, read_bytes, read_json
-from iscat_analysis.records import FREE_PARAMETERS, Clip, EventView, Progress, Trace, silent
+from iscat_analysis.records import Clip, EventView, Progress, Trace, silent
 
 PATIENCE_S = 1.0  # of compilation, before it is announced
 _ROOM = f"{_kernels.__name__}."
@@ -280,9 +280,5 @@ class Run:
     def warm_up(self, context: AnalysisContext) -> None:
         """Load or compile the kernels of fits."""
         config = context.config
-        parts = parts_of(
-            FREE_PARAMETERS[context.mode],
-            heights=has_prior(config),
-            posteriors=config.samples_posterior,
-        )
-        compile_kernels(context.model, parts)
+        heights = config.fit.heights_free or has_prior(config)
+        compile_kernels(context.model, heights=heights, posteriors=config.samples_posterior)

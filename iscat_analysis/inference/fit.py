@@ -36,7 +36,6 @@ bias of order 1/N is taken off.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import compress
 from typing import NamedTuple
@@ -580,27 +579,24 @@ def reach(
     return wider, higher
 
 
-def parts_of(free: Collection[str], *, heights: bool = False, posteriors: bool) -> tuple[str, ...]:
-    """Name the kernels that some fits need and others do not."""
-    needed = {"heights": heights or "z_nm" in free, "posteriors": posteriors}
-    return tuple(part for part, is_needed in needed.items() if is_needed)
+def compile_kernels(model: ForwardModel, *, heights: bool, posteriors: bool = False) -> None:
+    """Run the kernels of fits once on a few pixels, so that later calls find them compiled.
 
-
-def compile_kernels(model: ForwardModel, parts: Collection[str]) -> None:
-    """Run the kernels of fits once on a few pixels, so that later calls find them compiled."""
+    Those of heights that are free or have a prior, and of posteriors, are run where asked for.
+    """
     grid = PixelGrid.region((0, 3), (0, 3), 10.0)
     counts = np.full(grid.shape, 100.0)
     likelihood = poisson(model, grid, counts, counts, counts)
     theta = np.array([10.0, 10.0, model.height_nm, 1.0, 0.0])
     margin = np.array([1.0, 1.0, 0.0, 1.0, 0.0])
-    free = np.array([True, True, "heights" in parts, True, False])
+    free = np.array([True, True, heights, True, False])
     derivatives = np.random.default_rng(1).normal(size=(grid.shape[0], ROWS, grid.shape[1]))
-    if "heights" in parts:
+    if heights:
         likelihood.scan_heights(theta[2:3], theta, (0.0, 2.0))
     likelihood.maximize(theta, Box(free, theta - margin, theta + margin), passes=2)
     likelihood.score_fisher(theta)
     precision(likelihood, theta, np.eye(5), free, derivatives)
     goodness_of_fit(likelihood, theta, free, derivatives)
     likelihood.derivatives(theta, free)
-    if "posteriors" in parts:
+    if posteriors:
         likelihood.values(theta[None], pictured=True)

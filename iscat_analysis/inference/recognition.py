@@ -39,9 +39,6 @@ from iscat_analysis.optics.sized import SeatedModel, largest_dipole_nm
 from iscat_analysis.records import Alternative, Box, FitResult, FloatArray, Status, verdict
 from iscat_analysis.units import sphere_diameter_nm
 
-_STRENGTHS = np.geomspace(0.007, 0.25, 10)  # light per volume of a sphere whose index is fitted
-_REACHES_NM = (900.0, 700.0, 600.0, 500.0)  # around an image's centre, which each improves
-
 
 class _Sphere(NamedTuple):
     """A sphere at a maximum of its likelihood, with the information in its parameters."""
@@ -174,7 +171,8 @@ def _centred(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
     energy = np.maximum(signal**2 * likelihood.signal_information() - 1, 0.0)
     grid = likelihood.grid
     x, y = float(theta[0]), float(theta[1])
-    for reach in _REACHES_NM:
+    # around an image's centre, which each improves
+    for reach in (900.0, 700.0, 600.0, 500.0):
         near = (grid.y_nm[:, None] - y) ** 2 + (grid.x_nm - x) ** 2 < reach**2
         weight = np.where(near, energy, 0.0)
         if not weight.any():
@@ -206,7 +204,8 @@ def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool)
     model = model_of(seated)
     x, y, g = float(theta[0]), float(theta[1]), float(theta[LEVEL])
     masses = scanned_masses(model, *model.mass_range_kda)
-    strengths = _STRENGTHS if model.fits_index else np.ones(1)
+    # light per volume of a sphere whose index is fitted
+    strengths = np.geomspace(0.007, 0.25, 10) if model.fits_index else np.ones(1)
     own = model.strength_of(model.sphere.index.real) if model.fits_index else 1.0
     values = np.empty((masses.size, strengths.size))
     for i, mass in enumerate(masses.tolist()):

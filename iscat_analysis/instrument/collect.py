@@ -37,13 +37,7 @@ from iscat_analysis.instrument.particle_image import (
 )
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.model import ForwardModel
-from iscat_analysis.optics.parameters import (
-    FAINTEST,
-    LEAST_IMAGES,
-    MOST_IMAGES,
-    heights_free,
-    settings_of,
-)
+from iscat_analysis.optics.parameters import FAINTEST, LEAST_IMAGES, MOST_IMAGES, settings_of
 from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.records import FloatArray, Windows
 from iscat_analysis.search.bright import (
@@ -66,8 +60,6 @@ OTHERS_NM = 1700.0
 
 SAME_NM = 800.0
 """Nearer than this, and at the same time, two steps are one."""
-
-_KNOWN_APART_NM = (APART_NM, 1600.0, 1300.0, 1000.0, 700.0)
 
 
 @dataclass(frozen=True)
@@ -106,7 +98,7 @@ def bright_particle_images(
     """
     movie, config, camera = recording.movie, recording.config, recording.camera
     if background_mode(config) != "sliding":
-        if heights_free(config) and background_mode(config) == "fixed":
+        if config.heights_free and background_mode(config) == "fixed":
             return [], []
         return bright_places(recording.summed(), config)
     if (opening := recording.opening) is not None:
@@ -263,7 +255,7 @@ def known_places(
     Shapes: `known` (5,).
     """
     pixel, cut_out = _pixel_nm(config), _cutter(windows, config)
-    heights = config.fit.z_range_nm if heights_free(config) else None
+    heights = config.fit.z_range_nm if config.heights_free else None
 
     def cut(chosen: FloatArray, side: int) -> Images:
         places = np.rint(chosen[:, 1::-1] / pixel).astype(int).tolist()
@@ -282,7 +274,7 @@ def known_places(
     np.fill_diagonal(apart, np.inf)
     nearest = apart.min(axis=1, initial=np.inf)[inside]
     seen = [_among(image, others, 0.0) for image in cut(thetas[inside], _roi_px(config))]
-    for alone_nm in _KNOWN_APART_NM:
+    for alone_nm in (APART_NM, 1600.0, 1300.0, 1000.0, 700.0):
         images = _bright(s for s, d in zip(seen, nearest, strict=True) if d >= alone_nm)
         if len(images) >= least:
             break

@@ -87,7 +87,6 @@ from iscat_analysis.optics.parameters import (
     Settings,
     free_groups,
     free_names,
-    heights_free,
     prior_of,
     settings_of,
 )
@@ -165,7 +164,7 @@ def median_p(
     as_configured = _AsConfigured.of(config, images, mapper)
     shown: Images = images[:TESTED]
     x, y = 0.0, 0.0
-    if not heights_free(config):
+    if not config.heights_free:
         averages, shown = average_particle_images(shown)
         x, y = as_configured.centre(averages[0])
     shown = as_configured.placed([s.placed(s.x_nm + x, s.y_nm + y) for s in shown])
@@ -352,7 +351,7 @@ def learn_optics(
         return Learned(config, {}, (of.OPTICS_NOT_LEARNED({"reason": reason}),))
     if (
         reason
-        or config.fit.mode == "track"  # which learns from its tracks
+        or config.fit.follows_tracks  # where the optics are learned from the tracks
         or optics.calibrate == "never"
         or (optics.calibrate == "auto" and (optics.file is not None or terms_of(optics)))
     ):
@@ -463,7 +462,7 @@ def tested_optics(recording: Recording) -> Tested:
         if not _are_rejected(median, together):  # else more particles, and whose rings they show
             break
     change = NO_CHANGE
-    if not heights_free(config):
+    if not config.heights_free:
         view = FieldOfView.of(recording.movie, config)
         change = asked_change(fitted, config, settings_of(config), view, pool.map)
         over_field = [name for name in change.terms if name in FIELD]
@@ -473,7 +472,7 @@ def tested_optics(recording: Recording) -> Tested:
     if sliding and change.matters:  # which the first particles of a long movie tell badly
         images, others = bright_particle_images(recording, whole=True)
         alone = len(images)
-    elif auto and median < REJECTED_P and not heights_free(config) and not change.matters:
+    elif auto and median < REJECTED_P and not config.heights_free and not change.matters:
         pairs, median = not_alone(images, config, others, pool.map)
         images = [image for k, image in enumerate(images) if k not in pairs]
         alone -= sum(k < alone for k in pairs)
@@ -487,7 +486,7 @@ def _together(
     fitted: Images, config: Config, pool: ThreadPoolExecutor, terms: Sequence[str] = ()
 ) -> ScoreTest | None:
     """Test all images together against the configured optics."""
-    if heights_free(config):
+    if config.heights_free:
         return None
     build = microscopes(config, max(map(reach_nm, fitted), default=0.0))
     return score_test(fitted, build, settings_of(config), prior_of(config), terms, pool.map)
@@ -495,19 +494,18 @@ def _together(
 
 def why_not(config: Config) -> str:
     """Say of what movies, or with what configuration, no optics are learned."""
-    optics, mode, way = config.optics, config.fit.mode, background_mode(config)
-    tracks = mode == "track"
+    optics, way, tracks = config.optics, background_mode(config), config.fit.follows_tracks
     reasons = {
         "in mode track over a background that is not learned with the tracks": (
             tracks and way != "tracks"
         ),
-        "from dark field": optics.scheme == "darkfield",
+        "from dark field": not optics.interferes,
         f'with particle.model = "{config.particle.model}"': config.particle.is_sphere,
         f'with optics.convention = "{optics.convention}"': optics.convention != "exact",
         f'with optics.psf = "{optics.psf}"': optics.psf != "model",
-        'with background.method = "known"': config.background.method == "known",
-        f"in mode {mode} without background frames": (
-            not tracks and heights_free(config) and way != "fixed"
+        'with background.method = "known"': config.background.is_known,
+        f"in mode {config.fit.mode} without background frames": (
+            not tracks and config.heights_free and way != "fixed"
         ),
     }
     return next((reason for reason, holds in reasons.items() if holds), "")
@@ -600,7 +598,7 @@ def learned_from(
     config, pool, scan = recording.config, recording.pool, seen.focus_step_nm is not None
     crowded = background_mode(config) == "fixed" and not scan
     if not crowded or len(seen.images) >= LEAST_IMAGES:
-        asked = not scan and not heights_free(config) and set(groups) == set(FREE)
+        asked = not scan and not config.heights_free and set(groups) == set(FREE)
         view = FieldOfView.of(recording.movie, config) if asked else None
         found = learn(StandingAlone(seen, pool, view), config, groups, origin, pool.map).outcome
         if found.accepted or not crowded:
@@ -707,7 +705,7 @@ def learn_sign(
     config, optics = wrong.config, wrong.config.optics
     if reason := why_not(config):
         raise wrong.error(f"the optics are not learned {reason}")
-    if config.fit.mode == "track":
+    if config.fit.follows_tracks:
         raise wrong.error(
             "no track can be followed with it, from which the optics would be learned"
         )
@@ -721,7 +719,7 @@ def learn_sign(
         try:
             if noise_differs(recording):
                 raise DataError("the movie does not tell another: " + NOISE)
-            if heights_free(config):
+            if config.heights_free:
                 seen = _begun(recording, wrong.starts)
             else:
                 seen = Collected(config, *bright_particle_images(recording))
@@ -764,7 +762,7 @@ def _found(recording: Recording, seen: Collected) -> OpticsCalibration:
         if learned is None or learned.optics.reference_phase_deg != phase:
             raise DataError(f"by the movie the focus is {focus:.0f} nm, which has that sign too")
         return found
-    free = heights_free(config)
+    free = config.heights_free
     if free:
         near = replace(seen, near=found.measured.settings)
         every = fit_optics(near, tuple(FREE), origin, mapper)

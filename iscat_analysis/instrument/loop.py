@@ -53,7 +53,6 @@ from iscat_analysis.optics.parameters import (
     Settings,
     change_of,
     free_names,
-    heights_free,
     optics_limits,
     prior_of,
     settings_of,
@@ -63,9 +62,6 @@ from iscat_analysis.records import FloatArray, Mapper, Status, Windows
 
 STEP_FACTORS = (0.5, 2.0)
 """How much smaller or larger than said the steps of a scan may turn out."""
-
-
-_FOCUS_MOVES_NM = tuple(FOCUS_STEP_NM * i for i in (0, -1, 1, -2, 2, -3, 3))
 
 
 _OPTICS_PASSES = 8
@@ -198,7 +194,7 @@ def _likeliest(seen: Collected, search: OpticsSearch) -> _Begun:
     known, groups = dict(seen.near or {}), search.free
     build_wide = rings_of(seen.config, seen.images[0])
     lights = ("linear", "circular") if "polarization" in groups else (known["polarization"],)
-    focus_moves = _FOCUS_MOVES_NM if "focus" in groups else (0.0,)
+    steps = (0, -1, 1, -2, 2, -3, 3) if "focus" in groups else (0,)
     # to a standard error of one picture's χ²: a focus and heights that are one fringe off describe
     # the pictures nearly as well
     clear = 1 + math.sqrt(2 / math.prod(seen.images[0].grid.shape))
@@ -222,7 +218,7 @@ def _likeliest(seen: Collected, search: OpticsSearch) -> _Begun:
         return placed(fit.values, fit.images, one.others)
 
     tried = []
-    for light, moved in product(lights, focus_moves):
+    for light, moved in product(lights, [FOCUS_STEP_NM * step for step in steps]):
         there = {**known, "polarization": light, "focus_nm": known["focus_nm"] + moved}
         tried.append(placed(there, seen.images, seen.others, moved))
     tried.sort(key=lambda begun: begun.misfit)
@@ -489,7 +485,7 @@ class WholeField:
 
     def collect(self, rounds: Rounds) -> Collected | None:
         """Fit the field with what was learned last."""
-        free = heights_free(self.config)
+        free = self.config.heights_free
         if not rounds.all and not free:
             images, others = bright_places(self.windows, self.config, alone_nm=0.0)
             return Collected(self.config, images, others)
@@ -521,7 +517,7 @@ def seen_in_field(
     windows: Windows, config: Config, pool: ThreadPoolExecutor
 ) -> tuple[Images, Images]:
     """Fit the field, and cut out the particles that are farthest from others."""
-    free = heights_free(config)
+    free = config.heights_free
     fit = config.fit.model_copy(update={"mode": "joint" if free else "mass"})
     rows, columns = windows.after_e.shape
     context = make_context(config.model_copy(update={"fit": fit}), (rows, columns))

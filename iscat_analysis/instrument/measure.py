@@ -51,13 +51,7 @@ FOCUS_STEP_NM = 80.0
 """Step of the search over focus; a quarter of the depth of field at NA 1.2."""
 
 
-_LOOKED_FOR = ("focus_nm", "reference_phase_deg")
-
-
 _TURNS = 24  # of half a circle of phases, for strong particles
-
-
-_DIRECTIONS_DEG = (45.0, 90.0, 135.0)
 
 
 @dataclass(frozen=True)
@@ -126,7 +120,8 @@ def search_starts(
         )
 
     def likely(start: Start) -> float:
-        return start.explained + 2 * (prior.log_density(start.values, _LOOKED_FOR) if prior else 0)
+        known = ("focus_nm", "reference_phase_deg")
+        return start.explained + 2 * (prior.log_density(start.values, known) if prior else 0)
 
     found.sort(key=likely, reverse=True)
     kept: list[Start] = []
@@ -200,9 +195,6 @@ HELD_OUT_P = 1e-3
 
 _TRIAL_PASSES = 12  # of a second microscope on all pictures, and of one with fewer aberrations
 _HOPELESS = 0.03  # share of the log-likelihood by which a state lags that is given up
-_MASKS_NA = (0.35, 0.65)
-_FINER_MASKS_NA = (0.35, 0.5, 0.65, 0.8, 1.0)
-_FINER_TRANSMITS = (0.3, 0.75)
 _CLOSE = 0.01  # states whose average is explained this much worse are tried on all pictures
 
 
@@ -399,7 +391,7 @@ class OpticsSearch:
         if "mask" in self.free:
             # where no attenuation is configured
             dims = now["attenuation"] if now["attenuation"] < 0.9 else 0.3
-            edges = sorted({*_MASKS_NA, *([now["mask_na"]] if now["mask_na"] else [])})
+            edges = sorted({0.35, 0.65, *([now["mask_na"]] if now["mask_na"] else [])})
             masks = [
                 [{"mask_na": 0.0, "attenuation": now["attenuation"]}],
                 [{"mask_na": edge, "attenuation": dims} for edge in edges],
@@ -426,7 +418,7 @@ class OpticsSearch:
             values = start.values
             if "polarization" in self.free and values["polarization"] == "linear":
                 first = values["polarization_deg"]
-                turns = [{**values, "polarization_deg": first + t} for t in _DIRECTIONS_DEG]
+                turns = [{**values, "polarization_deg": first + t} for t in (45.0, 90.0, 135.0)]
                 (best,) = search_starts(averages, self.build, turns, most=1)
                 start = max(start, best, key=lambda each: each.explained)
             if "phase" not in self.free:  # the configured one is put back
@@ -501,7 +493,7 @@ class OpticsSearch:
         def begun(fit: Estimate) -> list[Start]:
             masked = [
                 {**fit.values, "mask_na": edge, "attenuation": dim}
-                for edge, dim in product(_FINER_MASKS_NA, _FINER_TRANSMITS)
+                for edge, dim in product((0.35, 0.5, 0.65, 0.8, 1.0), (0.3, 0.75))
                 if edge < fit.values["na"] - 0.1
             ]
             return self._begin(averages, masked, 1)

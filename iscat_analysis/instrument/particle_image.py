@@ -18,7 +18,7 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.last_used import memoize
 from iscat_analysis.optics.forward import ForwardModel, forward_model, peak_per_amplitude
 from iscat_analysis.optics.local import WEIGHTS, Spot, changes_at
-from iscat_analysis.optics.parameters import FOCUS_STEP, Settings, heights_free, with_settings
+from iscat_analysis.optics.parameters import FOCUS_STEP, Settings, with_settings
 from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.records import BoolArray, FloatArray
 
@@ -309,7 +309,7 @@ def signal_of(
 def build_microscope(config: Config, reach_nm: float, settings: Settings) -> ForwardModel:
     """Make the forward model of other optics, with the model's own mass scale."""
     changed = with_settings(config, settings).model_copy(update={"calibration": None})
-    seated = not heights_free(config) and not config.particle.height_is_open
+    seated = not config.heights_free and not config.particle.height_is_open
     highest = config.particle.nominal_height_nm if seated else None
     return forward_model(changed, reach_nm, z_max_nm=highest)
 
@@ -330,7 +330,7 @@ def reach_nm(image: ParticleImage) -> float:
 
 def refuse_uncalibratable(config: Config) -> None:
     """Refuse what has no reference to interfere with, or no derivative."""
-    if config.optics.scheme == "darkfield":
+    if not config.optics.interferes:
         raise ConfigError(
             'optics.scheme = "darkfield" has no reference, and the optics are learned from the '
             "interference with it: calibrate with an interferometric movie of the same microscope"

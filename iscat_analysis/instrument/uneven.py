@@ -71,7 +71,6 @@ LEAST_PICTURES = 6
 HELD_OUT_GAIN = 4.0
 """Log-likelihood that pictures that were not fitted must gain, to keep a change."""
 
-_SHARED = ("focus_nm", "reference_phase_deg")  # free beside a change before optics are learned
 _SIDE = 2  # pictures on either side of a jump
 
 
@@ -185,7 +184,8 @@ def asked_change(
     if len({image.spot for image in seen}) < LEAST_PICTURES:
         return NO_CHANGE
     build = microscopes(config, max(map(reach_nm, images)))
-    tests = _ScoreTests.of(seen, build, settings, _SHARED, view, mapper)
+    # free beside a change before optics are learned
+    tests = _ScoreTests.of(seen, build, settings, ("focus_nm", "reference_phase_deg"), view, mapper)
     return next(iter([*tests.changes(), *tests.rest()]), NO_CHANGE)
 
 

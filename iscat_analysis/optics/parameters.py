@@ -177,12 +177,6 @@ def optics_limits(n_immersion: float, n_glass: float) -> dict[str, tuple[float, 
     }
 
 
-def heights_free(config: Config) -> bool:
-    """Tell whether every particle has a height of its own, which is fitted."""
-    mode = config.fit.mode
-    return (config.track.free if mode == "track" else mode) in ("localize", "joint")
-
-
 def settings_of(config: Config) -> dict[str, Any]:
     """Parameters that a calibration may change, as configured."""
     optics = config.optics

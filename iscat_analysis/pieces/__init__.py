@@ -21,7 +21,7 @@ region has its centre at (0, 0) nm.
 from __future__ import annotations
 
 from iscat_analysis.config import CameraConfig as Camera
-from iscat_analysis.inference.fit import compile_kernels, fit_particle, parts_of
+from iscat_analysis.inference.fit import compile_kernels, fit_particle
 from iscat_analysis.pieces.counts import config_of, gather
 from iscat_analysis.pieces.limits import crb, psf, qcrb
 from iscat_analysis.pieces.regions import LogLikelihood, fit_rois, log_likelihood

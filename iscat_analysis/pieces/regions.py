@@ -16,7 +16,7 @@ from iscat_analysis.bounds.classical import ComplexArray
 from iscat_analysis.config import CameraConfig, Config, Optics, Particle, refuse_rod
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in, real_array
-from iscat_analysis.inference.fit import compile_kernels, fit_particle, parts_of, without_particle
+from iscat_analysis.inference.fit import compile_kernels, fit_particle, without_particle
 from iscat_analysis.inference.heights import has_prior, height_prior
 from iscat_analysis.inference.likelihood import LARGEST_LEVEL, LEVEL, Likelihood
 from iscat_analysis.optics.sized import SeatedModel, SizedModel
@@ -170,8 +170,7 @@ def fit_rois(
         raise DataError(f"corners_px: has shape {corners.shape}; give {(count, 2)} finite numbers")
     n_threads = int(number_in("workers", options["workers"], least=1, whole=True))
     templates = templates_of(counts)
-    parts = parts_of(config.fit.free, heights=has_prior(config), posteriors=False)
-    compile_kernels(counts.model, parts)
+    compile_kernels(counts.model, heights=config.fit.heights_free or has_prior(config))
     with threads(n_threads) as pool:
         rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
     table = make_rows(rows, {"event": range(count)})

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.inference.fit import compile_kernels, fit_particle, parts_of
+from iscat_analysis.inference.fit import compile_kernels, fit_particle
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.records import PARAMETERS, BoolArray, Box, FitResult, FloatArray, Status
 from iscat_analysis.study.scores import rank_test
@@ -94,7 +94,7 @@ def run_trials(
     truth = np.tile(setting.truth, (count, 1)) if truths is None else np.array(truths, dtype=float)
     begin = np.empty((count, 4))
     counts = np.empty((2, count, setting.pixels, setting.pixels)) if keep_counts else None
-    compile_kernels(setting.context.model, parts_of(setting.free, posteriors=False))
+    compile_kernels(setting.context.model, heights="z_nm" in setting.free)
 
     def work(i: int) -> tuple[FitResult, float]:
         random = trial_generator(seed, stream, i)
@@ -182,7 +182,7 @@ def calibrate_posterior(
     widths = np.full((draws, k), np.nan)
     inside = np.zeros((2, draws, k), dtype=bool)
     model = setting.context.model
-    compile_kernels(model, parts_of(setting.free, posteriors=True))
+    compile_kernels(model, heights="z_nm" in setting.free, posteriors=True)
     amplitudes = [model.scale.amplitude(float(m)) for m in (lower[3], upper[3])]
 
     def one(i: int) -> bool:

@@ -26,7 +26,7 @@ from iscat_analysis.inference.fit import goodness_of_fit
 from iscat_analysis.instrument.learning import REJECTED_P, adopted
 from iscat_analysis.instrument.loop import Rounds, learn
 from iscat_analysis.instrument.particle_image import Collected
-from iscat_analysis.optics.parameters import FREE, MOST_IMAGES, Settings, heights_free, settings_of
+from iscat_analysis.optics.parameters import FREE, MOST_IMAGES, Settings, settings_of
 from iscat_analysis.records import BoolArray
 from iscat_analysis.tracking.blocks import Aligned, Block
 from iscat_analysis.trust.systematic import MASS_SHARE, REJECTED_SHARE
@@ -134,7 +134,7 @@ def learn_from_tracks(
     run.notify("learning the optics from the tracks of the movie, which may take minutes…")
     start = _start(config, cause)
     # with free heights rings are taken for many particles, each with its own: that takes long
-    apart = trouble is not None or heights_free(config)
+    apart = trouble is not None or config.heights_free
     for cautious in (True,) if apart else (False, True):
         try:
             trial = begin(config, cautious=True) if cautious and trouble is None else begun

@@ -34,18 +34,6 @@ from iscat_analysis.records import FREE_PARAMETERS, BoolArray, FloatArray, Statu
 SAME_NM = 150.0
 """Distance within which two steps are at one place."""
 
-# Mass of a particle over that of a step, from which on the step may be a change of its light.
-_LEAST_MASS_RATIO = 3.0
-# Change of a mean over a window, in standard deviations of the fluctuation of a frame, that hardly
-# ever is exceeded: four of a difference of two.
-_LARGEST_CHANGE = 4 * math.sqrt(2)
-# Mass of a particle over that of a step beside it, from which on it may have moved: 20 nm change a
-# image by a fifth.
-_LEAST_MASS_RATIO_BESIDE = 5.0
-# Expected gain in log-likelihood of a rise over a step, from which on rises are mostly seen, and
-# from which on a step without one does not rise. A rise that is missed makes the mass, and this
-# gain with it, too small.
-_LEAST_GAIN_SEEN, _LEAST_GAIN_CERTAIN = 10.0, 30.0
 _FEWEST, _SHARE = 3, 0.2  # rises, and their share of the steps in which they would be seen
 _NO_STEP = (Status.SIDELOBE.value, Status.NOT_CONVERGED.value)
 
@@ -60,7 +48,10 @@ def at_a_shared_place(
 
     Shapes: result (rows,).
     """
-    least_here = 1 / max(1 / _LEAST_MASS_RATIO, _LARGEST_CHANGE * relative)
+    # mass of a particle over that of a step, from which on the step may be a change of its light;
+    # and the change of a mean over a window, in standard deviations of the fluctuation of a frame,
+    # that hardly ever is exceeded: four of a difference of two
+    least_here = 1 / max(1 / 3.0, 4 * math.sqrt(2) * relative)
     flagged = np.zeros(len(table), dtype=bool)
     steps = _Steps.of(table)
     for i, j in steps.pairs(max(SAME_NM, 0.61 * resolution_nm)):  # λ/NA within which that is
@@ -70,7 +61,9 @@ def at_a_shared_place(
         both = mass[i] + mass[j]
         gone = mass[i] * mass[j] < 0 and abs(both) < 4 * np.hypot(steps.error[i], steps.error[j])
         same = math.dist(steps.place[i], steps.place[j]) < SAME_NM
-        least = least_here if same else _LEAST_MASS_RATIO_BESIDE
+        # mass of a particle over that of a step beside it, from which on it may have moved: 20 nm
+        # change an image by a fifth
+        least = least_here if same else 5.0
         if (there or near) and not gone and abs(mass[i]) > least * abs(mass[j]):
             flagged[steps.row[j]] = True
     return flagged
@@ -145,14 +138,17 @@ def may_rise(
     before, after = (table[name].to_numpy(float) for name in ("n_before", "n_after"))
     one2 = (mass / crb) ** 2 * (before + after) / (before * after)
     gain = np.nan_to_num(one2) * frames / 24
-    seen = (gain > _LEAST_GAIN_SEEN) & ~shared_place
+    # expected gain in log-likelihood of a rise over a step, from which on rises are mostly seen
+    seen = (gain > 10.0) & ~shared_place
     if (rising & seen).sum() < max(_FEWEST, _SHARE * seen.sum()):
         return nothing
     goes_on = table["flags"].fillna("").astype(str).str.contains(Status.CHANGING.value).to_numpy()
     # share of rising steps that go on rising, beyond which all may; by chance it is 0.002
     many = (goes_on & rising).sum() >= max(_FEWEST, 0.1 * rising.sum())
     alike = rising if many else nothing[0]
-    return (~rising & (gain < _LEAST_GAIN_CERTAIN)) | alike, frames
+    # gain from which on a step that is no rise does not rise; one that is missed makes the mass,
+    # and this gain with it, too small
+    return (~rising & (gain < 30.0)) | alike, frames
 
 
 def slow_landings(frames: float, unseen: int, rising: int, rows: int) -> Finding | None:
@@ -171,7 +167,6 @@ _PRIOR = 0.1  # probability that a movie fluctuates, before its frames are looke
 _ALONE = 0.05  # probability that an event changes on its own
 _RELATIVE = np.geomspace(0.01, 0.3, 60)
 _CORRELATIONS = np.geomspace(2.0, 1000.0, 20)  # frames
-_KNOWN = 16.0  # components that the noise of half a window counts for in that of longer ones
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value, Status.CHANGING.value})
 
 
@@ -317,7 +312,8 @@ def _noise(
         level = np.interp(lengths, measured, levels)
         return _binned(np.where(lengths > 4 * measured[0], level * slow, level), bins)
 
-    excess = number = _KNOWN
+    # components that the noise of half a window counts for in that of longer ones
+    excess = number = 16.0
     for square, count, n in zip(squares, counts, frames.tolist(), strict=True):
         bins = int((count > 0).sum())
         if bins:

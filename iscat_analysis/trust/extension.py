@@ -48,13 +48,10 @@ FEWEST = 6
 
 _SIGNIFICANT = 4.0  # standard errors of the mean variance beyond which all particles have it
 _CHANCE = 1e-5  # probability that the image of a point is flagged
-# Shift of a mass, in σ, from which on its row is flagged where all particles are extended.
-_LEAST_SHIFT_SIGMAS = 0.5
 _OUTLIER_SIGMAS = 4.0  # standard errors beyond which an event is not one of many
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value})
 _HIDDEN = 0.5  # probability that length, or time, shows nothing of a spread
-_LEAST_LEFT = 1e-3  # share of a width that learned optics do not imitate; less is rounding
-_STEPS, _REACH_SIGMAS = 1000, 6.0  # of the √v over which the posterior is summed
+_REACH_SIGMAS = 6.0  # of the √v over which the posterior is summed
 
 LogLikelihood = Callable[[FloatArray], FloatArray]
 
@@ -130,7 +127,8 @@ class Extension:
         shift = slope * math.hypot(middle, sd)
         flagged = known & (q > 0) & (np.nan_to_num(evidence.chi2_spread) > chdtri(3, _CHANCE))
         if is_common:
-            too_light = shift > _LEAST_SHIFT_SIGMAS * table["sigma_mass_kda"].to_numpy(float)
+            # shift of a mass, in σ, from which on its row is flagged
+            too_light = shift > 0.5 * table["sigma_mass_kda"].to_numpy(float)
             flagged = flagged | (known & too_light)
         across, along, error_across = evidence[7:10]
         squares = np.nan_to_num((across**2 + along**2) / error_across**2)
@@ -179,7 +177,7 @@ def _posterior(
     """Mean and standard deviation of v from the width and from measurements of a share [nm²]."""
     mean, error = width
     reach = math.sqrt(max(mean, 0.0) + _REACH_SIGMAS * error)
-    root = np.linspace(0.0, min(reach, _REACH_SIGMAS * prior_sd_nm), _STEPS)
+    root = np.linspace(0.0, min(reach, _REACH_SIGMAS * prior_sd_nm), 1000)
     v = root**2
     if v[-1] == 0:
         return 0.0, 0.0
@@ -212,7 +210,8 @@ def _beside_learned_optics(config: Config, table: pd.DataFrame) -> tuple[float, 
     respond = response_of(config, table)
     scale = forward_model(config, respond.model.reach_nm).scale
     shifts = respond.to_width(float(scale.amplitudes(float(table["mass_kda"].abs().median()))))
-    return max(shifts.left, _LEAST_LEFT), abs(shifts.amplitude)
+    # share of a width that learned optics do not imitate; less is rounding
+    return max(shifts.left, 1e-3), abs(shifts.amplitude)
 
 
 def _mean(q: FloatArray, se: FloatArray) -> tuple[float, float]:
@@ -291,10 +290,6 @@ def _wiggle(
     return (x + y) / 2 - known_nm**2, math.hypot(x_se, y_se) / 2
 
 
-_DESCRIBED = frozenset({Status.OK.value, Status.POOR_FIT.value})
-"""Verdicts with which a height can still be read; a height that is held makes fits poor itself."""
-
-
 @dataclass(frozen=True)
 class Heights:
     """Heights that the light of all events shows, and the mass shifts that follow."""
@@ -308,7 +303,8 @@ class Heights:
     def of(cls, config: Config, table: pd.DataFrame, evidence: Evidence) -> Heights | None:
         """Estimate the heights from all rows; None where there are too few."""
         held = not has_prior(config)
-        kinds = _DESCRIBED if held else frozenset({Status.OK.value})
+        # a height that is held makes fits poor itself
+        kinds = _JUDGED if held else frozenset({Status.OK.value})
         good = has_only(table, kinds)
         spread = spread_of_heights(evidence.z_nm[good], evidence.sigma_z_nm[good])
         if spread is None:

@@ -28,9 +28,6 @@ from iscat_analysis.records import (
 )
 from iscat_analysis.search.empty import CONTRASTS, EmptyField, EmptySpread
 
-# Of the square's side; a poor fit leaves its rings over
-_NEAR_SHARE, _NEAR_SHARE_POOR = 1 / 3, 1 / 2
-_LARGEST_SIGNAL_SHARE = 0.1
 _WHOLE = CONTRASTS.index("whole")
 
 
@@ -43,7 +40,8 @@ def taken_places(
     """
     taken = np.zeros(shape, dtype=np.bool_)
     for x, y, described in places:
-        reach = context.roi_px * (_NEAR_SHARE if described else _NEAR_SHARE_POOR)
+        # of the square's side; a poor fit leaves its rings over
+        reach = context.roi_px * (1 / 3 if described else 1 / 2)
         top, left = max(math.ceil(y - reach), 0), max(math.ceil(x - reach), 0)
         box = taken[
             top : max(math.floor(y + reach) + 1, 0), left : max(math.floor(x + reach) + 1, 0)
@@ -67,10 +65,7 @@ def taken_by(
         [(e.candidate.x_px, e.candidate.y_px, Status.POOR_FIT not in e.flags) for e in events],
     )
     if context.additive:
-        taken |= (
-            photons_scale(context, windows) * signal
-            > _LARGEST_SIGNAL_SHARE * windows.after_e.mean()
-        )
+        taken |= photons_scale(context, windows) * signal > 0.1 * windows.after_e.mean()
     return taken
 
 

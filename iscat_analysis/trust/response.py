@@ -27,7 +27,6 @@ COMMON = (*PARAMETERS, "contrast")
 """What such errors are told of; of the contrast where it is the result, without a calibration."""
 
 _AMPLITUDES = 4  # at which the response to the optics is computed, for the span of all events
-_XX, _YY = 5, 7  # rows of second derivatives
 
 
 class Shifts(NamedTuple):
@@ -176,7 +175,8 @@ class Response:
         """Shifts per variance of the places of a particle along each axis [1/nm²]."""
         theta = self.theta(self.model.height_nm, amplitude)
         rows = self.expected(theta).derivatives(theta)
-        return self.to_input((rows[:, _XX] + rows[:, _YY]) / 2, amplitude)
+        # rows of ∂xx and ∂yy
+        return self.to_input((rows[:, 5] + rows[:, 7]) / 2, amplitude)
 
     def _along_index(self, theta: FloatArray) -> list[FloatArray]:
         """Differentiate the picture of a sphere along its index, (1, ny, nx)."""
@@ -218,7 +218,7 @@ def response_of(
         grid,
         names,
         tuple(name in FREE_PARAMETERS[config.fit.mode] for name in PARAMETERS),
-        level=config.background.method == "sliding",
+        level=config.background.slides,
         frames=(int(table["n_before"].median()), int(table["n_after"].median())),
         contrast=contrast,
         prior=prior_of(config).errors(names),

@@ -60,7 +60,6 @@ MASS_SHARE = 0.4
 """Error of masses over what optics that are wrong leave over of the pictures: root mean square of
 eleven such microscopes, 0 to 0.97."""
 
-_SPREAD = 2.0  # ratio of squared SNR, over which noise and misfit can be told apart
 _LEAST_SIGMAS = 0.5  # of σ, beyond which it is in the budget
 _SAME = 1e-6  # change of the scale, which rounding leaves between equal optics
 # What rounding leaves of a place, mass or contrast that the optics do not change [nm, kDa, and 1]
@@ -193,7 +192,7 @@ def _predicts_pictures(config: Config) -> bool:
     """Whether an exact model makes pictures that interfere, of pixels of known size."""
     optics = config.optics
     exact = optics.convention == "exact" and optics.psf == "model"
-    return exact and optics.scheme != "darkfield" and config.camera.pixel_size_nm is not None
+    return exact and optics.interferes and config.camera.pixel_size_nm is not None
 
 
 _FROM_LIGHT = ("measured", "assumed")
@@ -208,7 +207,7 @@ def _of_the_camera(config: Config, camera: Mapping[str, Any]) -> Iterator[Source
     large by δ/counts.  The gain is in both, and leaves it as it is.
     """
     offset, law, light = (camera.get(key) for key in ("offset_adu", "law", "light_adu"))
-    if not _fits_masses(config) or config.optics.scheme == "darkfield":
+    if not (config.fit.masses_free and config.optics.interferes):
         return
     if offset is not None and light:
         known = offset["from"] in (*_FROM_LIGHT, "dark frames")
@@ -251,7 +250,7 @@ def _of_the_selection(threshold_snr: float, config: Config, table: pd.DataFrame)
     Of a Gaussian of which what is u standard deviations below its middle is cut off, the mean is
     φ(u)/Φ(u) standard deviations higher.
     """
-    if not _fits_masses(config):
+    if not config.fit.masses_free:
         return {}
     sigma, snr = (table[name].to_numpy(float) for name in ("sigma_mass_kda", "snr"))
     over = np.maximum(snr - threshold_snr, 0.0)
@@ -263,13 +262,9 @@ def _of_the_selection(threshold_snr: float, config: Config, table: pd.DataFrame)
 def _of_the_missing_record(scale: MassScale, config: Config, table: pd.DataFrame) -> Sigmas:
     """Give what the carried scale is wrong by, if the standards had the optics of the movie."""
     line, share = config.calibration, abs(scale.carried - 1)
-    if line is None or not line.optics_assumed or share < _SAME or not _fits_masses(config):
+    if line is None or not line.optics_assumed or share < _SAME or not config.fit.masses_free:
         return {}
     return {"mass_kda": share * _masses(table)}
-
-
-def _fits_masses(config: Config) -> bool:
-    return "mass_kda" in FREE_PARAMETERS[config.fit.mode]
 
 
 def misfit_error(table: pd.DataFrame, pixels: int) -> float:
@@ -289,7 +284,8 @@ def misfit_error(table: pd.DataFrame, pixels: int) -> float:
     rise, over = float(np.median(power[half:])), float(np.median(excess[half:]))
     error = 1.2533 * math.sqrt(2 / pixels / half)  # standard error of a median over that of a mean
     faint = float(np.median(power[:half]))
-    if rise > _SPREAD * faint:
+    # ratio of squared SNR, over which noise and misfit can be told apart
+    if rise > 2.0 * faint:
         rise, over = rise - faint, over - float(np.median(excess[:half]))
         error *= math.sqrt(2)
     if over < 5.0 * error:  # by which something is left over
@@ -309,7 +305,7 @@ def _of_heavy_particles(scale: MassScale, config: Config, table: pd.DataFrame) -
 
     It shifts all masses to one side, and is given if all rows together would show it.
     """
-    if not _fits_masses(config):
+    if not config.fit.masses_free:
         return {}
     off, sigma = _off_the_line(scale, table)
     return {"mass_kda": off} if np.nansum((off / sigma) ** 2) > _LEAST_SIGMAS**2 else {}
@@ -386,7 +382,7 @@ def _of_configured_optics(tested: Mapping[str, Any], config: Config, table: pd.D
 
 def _is_about_contrast(config: Config) -> bool:
     """Whether contrasts are the result: masses are fitted, and no calibration makes them."""
-    return _fits_masses(config) and config.calibration is None
+    return config.fit.masses_free and config.calibration is None
 
 
 def _shifts(config: Config, model: ForwardModel, table: pd.DataFrame) -> FloatArray:
@@ -403,7 +399,7 @@ def _shifts(config: Config, model: ForwardModel, table: pd.DataFrame) -> FloatAr
     bases = tuple(base for base in every if base != REFERENCE)
     found = np.zeros((len(table), len(COMMON), len(bases) + 1))
     found[..., :-1] = _base_shifts(config, model, table, bases) if bases else 0.0
-    if _fits_masses(config):  # a brighter reference dims the interference
+    if config.fit.masses_free:  # a brighter reference dims the interference
         found[:, 3, -1] = -table["mass_kda"].to_numpy(float)
     bases = (*bases, REFERENCE)
     x, y, half = centre_of(config.optics, (1, 1))
@@ -439,7 +435,7 @@ def _base_shifts(
         found = np.einsum("en,nik->eik", by_amplitude[near], respond.at(float(height), nodes))
         shifts[near] += weight[near, None, None] * found
     shifts[:, 4] *= table["contrast"].to_numpy(dtype=float)[:, None]
-    if _fits_masses(config):
+    if config.fit.masses_free:
         shifts[:, 3] *= (amplitude * model.scale.slopes(amplitude))[:, None]
         if standards_share(config):
             line, scale = config.calibration, model.scale
@@ -454,7 +450,7 @@ def _of_the_standards(config: Config, table: pd.DataFrame) -> Sigmas:
     line, pixel = config.calibration, config.camera.pixel_size_nm
     if line is None or line.optics is None or line.covariance is None or pixel is None:
         return {}
-    if line.optics.psf == "measured" or standards_share(config) or not _fits_masses(config):
+    if line.optics.psf == "measured" or standards_share(config) or not config.fit.masses_free:
         return {}
     middle = line.covariance.of_the_middle
     relative = response_of(at_standards(config), table, middle.names).faint()
@@ -515,7 +511,7 @@ def assumed_error(key: str, config: Config, table: pd.DataFrame) -> Sigmas:
         return {}
     if config.fits_sizes:
         return _of_spheres(key, config, table, sigma)
-    suited = _predicts_pictures(config) and _fits_masses(config)
+    suited = _predicts_pictures(config) and config.fit.masses_free
     if key == "index" or line is None or not suited:
         return {}
     there = at_standards(config)
@@ -542,7 +538,7 @@ def _of_spheres(key: str, config: Config, table: pd.DataFrame, sigma: float) -> 
     An index that was fitted is not assumed, and takes its part of what other inputs have wrong.
     """
     mass = _masses(table)
-    if config.optics.scheme == "darkfield" or not np.isfinite(mass).any():
+    if not (config.optics.interferes and np.isfinite(mass).any()):
         return {}
     own, share = has_own_index(table), np.zeros(mass.size)
     offset = _Offset(key, sigma, config, response_of(config, table))
@@ -659,7 +655,6 @@ SCALE = "scale of the model", "measure standards (iscat calibrate mass)"
 SPHERES = "density of the spheres", "weigh some: a diameter does not need it"
 """The same of spheres, whose masses follow from their pictures with these."""
 
-_LEAST_WIDTH = 0.25  # of σ: a width beneath it is not worth a line
 _CLEAR_SIGMAS = 3.0  # standard errors by which noise is more than σ says
 
 
@@ -748,7 +743,8 @@ def wide_species(across: Sequence[Mapping[str, Any]], *, calibrated: bool) -> Fi
         if low is None or width is None or not math.isfinite(low) or not one["mass_kda"]:
             continue  # nothing is a share of no mass
         sigma = width / math.sqrt(max(one["spread_over_sigma"] ** 2 - 1, 1e-12))
-        if low > max(one["explained_kda"], _LEAST_WIDTH * sigma):
+        # of σ: a width beneath it is not worth a line
+        if low > max(one["explained_kda"], 0.25 * sigma):
             wide.append(one)
     if not wide:
         return None

@@ -20,7 +20,7 @@ import scipy
 from iscat_analysis.config import Config
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.optics import UNEVEN_REFERENCE
-from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
+from iscat_analysis.records import FloatArray, Status
 
 TERMS = ("reference_tilt_x", "reference_tilt_y", "reference_curvature")
 
@@ -33,10 +33,6 @@ GAIN = 14.0
 
 
 _LARGEST = 0.3  # of a coefficient
-_WIDTHS = (0.5, 30.0)  # of a kernel, over the error of a mass
-_SPECIES = 2.0  # width of kernels above which masses are not those of a few species
-_BACKGROUND = 1e-3  # density of masses anywhere, over the logarithm of the mass
-_NEEDED = ("x_px", "y_px", "mass_kda", "sigma_mass_kda", "status")
 _STEP = 1e-3  # of numerical second derivatives
 
 
@@ -68,9 +64,9 @@ def reference_map(config: Config, table: pd.DataFrame) -> ReferenceMap | None:
     """Find how the amplitude of the reference changes over the field, if masses ask for it."""
     optics = config.optics
     configured = any(optics.field_term(name) for name in TERMS)
-    fitted = "mass_kda" in FREE_PARAMETERS[config.fit.mode] and config.fit.mode != "track"
-    shown = fitted and set(_NEEDED) <= set(table.columns)
-    if configured or optics.scheme == "darkfield" or not shown:
+    fitted = config.fit.masses_free and not config.fit.follows_tracks
+    shown = {"x_px", "y_px", "mass_kda", "sigma_mass_kda", "status"} <= set(table.columns)
+    if configured or not (optics.interferes and fitted and shown):
         return None
     good = table[(table["status"] == Status.OK.value) & (table["sigma_mass_kda"] > 0)]
     relative = (good["sigma_mass_kda"] / good["mass_kda"].abs()).sort_values()
@@ -82,7 +78,8 @@ def reference_map(config: Config, table: pd.DataFrame) -> ReferenceMap | None:
     field_px = optics.field_px or _field_of(x, y)
     place = _places(x, y, field_px)
     terms, gain = _fitted(mass, sigma, place)
-    far = np.abs(terms[:-1]).max() >= _LARGEST or math.exp(terms[-1]) > _SPECIES
+    # a coefficient at its limit, or kernels so wide that masses are not those of a few species
+    far = np.abs(terms[:-1]).max() >= _LARGEST or math.exp(terms[-1]) > 2.0
     if gain < GAIN or far:
         return None
     rng = np.random.default_rng(len(rows))
@@ -118,7 +115,8 @@ def _fitted(mass: FloatArray, sigma: FloatArray, place: FloatArray) -> tuple[Flo
     def worse(terms: FloatArray) -> float:
         return -_agreement(mass, sigma, place, terms)
 
-    low, high = (math.log(width) for width in _WIDTHS)
+    # of a kernel, over the error of a mass
+    low, high = (math.log(width) for width in (0.5, 30.0))
     bounds = [(-_LARGEST, _LARGEST)] * place.shape[1] + [(low, high)]
     widths = np.linspace(low, high, 12)
     alone = -min(worse(np.array([0.0, 0.0, 0.0, w])) for w in widths)
@@ -141,7 +139,8 @@ def _agreement(mass: FloatArray, sigma: FloatArray, place: FloatArray, terms: Fl
     apart = logarithm[:, None] - logarithm
     density = np.exp(-(apart**2) / (2 * variance)) / np.sqrt(2 * math.pi * variance)
     density *= (mass[:, None] * mass > 0) & ~np.eye(len(mass), dtype=bool)
-    return float(np.log(density.sum(axis=1) / (len(mass) - 1) + _BACKGROUND).sum())
+    # density of masses anywhere, over the logarithm of the mass
+    return float(np.log(density.sum(axis=1) / (len(mass) - 1) + 1e-3).sum())
 
 
 def _curvature(
