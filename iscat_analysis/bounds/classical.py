@@ -10,15 +10,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from iscat_analysis._kernels import ComplexArray
 from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood, ModelLikelihood
-from iscat_analysis.records import PARAMETERS
-
-FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
+from iscat_analysis.records import PARAMETERS, FloatArray
 
 SINGULAR = 1e-9
 """Eigenvalue of the normalised Fisher matrix that counts as zero.

@@ -32,16 +32,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
+from iscat_analysis._kernels import ComplexArray
 from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.forward import ForwardModel
-from iscat_analysis.records import PARAMETERS
-
-FloatArray = npt.NDArray[np.float64]
-ComplexArray = npt.NDArray[np.complex128]
+from iscat_analysis.records import PARAMETERS, FloatArray
 
 
 @dataclass(frozen=True)

@@ -16,17 +16,15 @@ from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from iscat_analysis._kernels.pupil import make_pupil, rectangle
 from iscat_analysis.bounds.experiment import plan
 from iscat_analysis.bounds.quantum import Measure, quantum_bounds, quantum_information
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.optics.forward import ForwardModel, forward_model
-from iscat_analysis.records import PARAMETERS, Progress, silent
+from iscat_analysis.records import PARAMETERS, FloatArray, Progress, silent
 from iscat_analysis.threads import threads
 
-FloatArray = NDArray[np.float64]
 Convention = Literal["dong2021", "exact"]
 
 SCHEMES = ("iscat", "cobri", "darkfield")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.bounds.classical import ComplexArray
+from iscat_analysis._kernels import ComplexArray
 from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.camera import Trajectory
 from iscat_analysis.fitting.context import AnalysisContext

@@ -15,10 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.units import count
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 LARGEST = 1e15
 """No mass [kDa], light [e] or number of frames is larger; the square of one is still a number.

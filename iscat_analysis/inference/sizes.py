@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import generate_binary_structure, maximum_filter
 from scipy.special import ndtr
 
@@ -20,10 +19,7 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.maximiser import Optimum
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.sized import SizedModel
-from iscat_analysis.records import Alternative, Box
-
-FloatArray = NDArray[np.float64]
-
+from iscat_analysis.records import Alternative, Box, FloatArray
 
 AMBIGUITY_ODDS = 1000.0
 """Another height or diameter whose odds against the best are shorter than this is reported as

@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
+from iscat_analysis._kernels import ComplexArray
 from iscat_analysis.bounds import event_bounds
-from iscat_analysis.bounds.classical import ComplexArray
 from iscat_analysis.config import CameraConfig, Config, Optics, Particle, refuse_rod
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in, real_array
