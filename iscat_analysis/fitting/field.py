@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -96,31 +96,27 @@ def fit_field(
     return tuple(sorted(judged, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), field.windows
 
 
+@dataclass
 class FieldFit:
     """Fits of particles in turns; `windows` are the frames, with the power as it is estimated."""
 
-    def __init__(
-        self,
-        context: AnalysisContext,
-        windows: Windows,
-        excess_noise: ExcessNoise | None,
-        pool: ThreadPoolExecutor,
-    ) -> None:
-        self.windows = windows
-        self._context, self._excess_noise, self._pool = context, excess_noise, pool
+    context: AnalysisContext
+    windows: Windows
+    excess_noise: ExcessNoise | None
+    pool: ThreadPoolExecutor
 
     def search(
         self, events: Sequence[Fitted], explains: float = EXPLAINS
     ) -> tuple[list[Candidate], list[Candidate]]:
         """As `search_field`."""
         return search_field(
-            self._context, self.windows, events, self._excess_noise, explains=explains
+            self.context, self.windows, events, self.excess_noise, explains=explains
         )
 
     def signal(self, events: Sequence[Fitted]) -> FloatArray:
         """Give the signal of particles over the field."""
         rows, columns = self.windows.after_e.shape
-        return total_signal(self._context, (rows, columns), events)
+        return total_signal(self.context, (rows, columns), events)
 
     def large_ones(self) -> list[Fitted]:
         """Find spheres before anything else, the brightest first.
@@ -128,7 +124,7 @@ class FieldFit:
         The search for dipoles would take the rings of their images for particles.  A place is where
         the light changes most, whatever the shape of the image.
         """
-        context = self._context
+        context = self.context
         found: list[Fitted] = []
         dipoles: list[Fitted] = []  # whose rings are no places of their own
         if not context.spheres_of(context.model):
@@ -153,7 +149,7 @@ class FieldFit:
             if not may_be_large(best.likelihood, best.fit):
                 dipoles.append(best)
                 continue
-            (large,) = with_spheres(context, [best], self._pool, level=False)
+            (large,) = with_spheres(context, [best], self.pool, level=False)
             if large.sphere:
                 vain = 0
             if large.sphere or _chi2_left(large) < EXPLAINS * large.snr**2:
@@ -164,11 +160,11 @@ class FieldFit:
         """Fit all particles in turns, until fits near each other hardly change."""
         # two fits that share the light of one particle converge slowly
         for sweep in range(16 if events else 0):
-            last = _without_doubles(events, self._context)
+            last = _without_doubles(events, self.context)
             events = self.fit(last)
             self.refine_power(events)
             # at least two fits of everything with everything else in place
-            if sweep + 1 >= 2 and _is_settled(last, events, self._context.roi_px / 2):
+            if sweep + 1 >= 2 and _is_settled(last, events, self.context.roi_px / 2):
                 break
         return events
 
@@ -191,7 +187,7 @@ class FieldFit:
             self.refine_power(trial)
         while len(trial) > len(known):
             trial = self.settled(trial)
-            kept = _tenable(self._context, trial, known)
+            kept = _tenable(self.context, trial, known)
             if len(kept) == len(trial) > len(known):
                 return trial
             if len(kept) == len(trial):
@@ -212,7 +208,7 @@ class FieldFit:
         self, candidates: Sequence[Candidate], events: Sequence[Fitted], first: int
     ) -> list[Fitted]:
         """Fit candidates, of which number i replaces event ``first + i``, if there is one."""
-        context, windows = self._context, self.windows
+        context, windows = self.context, self.windows
         nominal = context.model.material.mass_kda
         free = FREE_PARAMETERS[context.mode]
         taken: FloatArray | None = None
@@ -241,7 +237,7 @@ class FieldFit:
                     images.append((index, image))
             return images
 
-        for images in self._pool.map(drawn, range(len(events))):
+        for images in self.pool.map(drawn, range(len(events))):
             for index, image in images:
                 beside[index] += image
 
@@ -261,11 +257,11 @@ class FieldFit:
             fit = fit_particle(likelihood, start, context.mode, z_range, level=False)
             return Fitted(region, fit, likelihood)
 
-        return [event for event in self._pool.map(one, range(len(candidates))) if event is not None]
+        return [event for event in self.pool.map(one, range(len(candidates))) if event is not None]
 
     def refine_power(self, events: Sequence[Fitted]) -> None:
         """Estimate the power again over a background without the particles."""
-        context = self._context
+        context = self.context
         if not context.config.background.power_normalization:
             return
         signal = context.left(self.signal(events))
@@ -276,14 +272,14 @@ class FieldFit:
     def reported(self, events: Sequence[Fitted]) -> list[Fitted]:
         """Select fits of the sign that is reported which others do not explain."""
         # of the threshold: a fit whose final SNR is below it is explained by the others
-        least = 0.95 * self._context.templates.threshold
-        any_sign = self._context.additive or not self._context.config.detection.sign
-        sign = self._context.config.detection.sign
+        least = 0.95 * self.context.templates.threshold
+        any_sign = self.context.additive or not self.context.config.detection.sign
+        sign = self.context.config.detection.sign
         return [e for e in events if e.snr > least and (any_sign or sign * e.fit.contrast > 0)]
 
     def judged(self, fitted: Sequence[Fitted], lobes: Sequence[Fitted]) -> list[Event]:
         """Add the flags that depend on the neighbourhood: saturation, crowding, side lobes."""
-        judged, context, windows = [], self._context, self.windows
+        judged, context, windows = [], self.context, self.windows
         limit = context.config.detection.min_separation_nm
         reach = LARGEST_IMAGE * context.roi_px * context.pixel_nm
         for number, one in enumerate((*fitted, *lobes)):

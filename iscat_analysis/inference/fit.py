@@ -28,7 +28,7 @@ outlier
 Each p-value (`three_tests`) is uniform on good data; `goodness_of_fit` joins them by Šidák's rule.
 
 Errors are those of the expected information and, where the likelihood is no parabola within them,
-of how far it falls (`reach`).  A position that is fitted follows the noise to where it adds to the
+of how far it falls (`_far`).  A position that is fitted follows the noise to where it adds to the
 particle, so that the amplitude comes out too large, by about 1/SNR²: 1 % at 10, 11 % at 3; this
 bias of order 1/N is taken off.
 """
@@ -155,7 +155,8 @@ def fit_particle(
     found = _judged(likelihood, optima[0], box)
     if not all_followed and not found.p_value >= POOR_FIT_P:
         optima, found = _also_from(likelihood, _inside(begin, box), box, optima, found)
-    if reaches_far(likelihood, found.sigma):
+    quarter = likelihood.model.fringe_nm / 4  # farther away the likelihood may be no parabola
+    if any(AWAY * error > quarter for error in found.sigma[:3].tolist()):
         wider, higher = _far(likelihood, box, found)
         if higher is not None:
             optima, found = _also_from(likelihood, higher, box, optima, found)
@@ -166,7 +167,9 @@ def fit_particle(
     optima = _distinct(optima, model)
     alternatives = _alternatives(optima)
     estimate, sigma_kda = best.theta, float(sigma[AMPLITUDE])
-    if correct_bias and known and _is_small(bias, sigma, box, found.slope):
+    # an expansion has lost its meaning if its first term exceeds the error
+    sizes = np.abs(bias[:4]) * [1.0, 1.0, 1.0, found.slope]
+    if correct_bias and known and np.all((sizes <= sigma) | ~box.free[:4]):
         estimate = _inside(estimate - bias, box)
     x, y, z, amplitude = estimate[:4].tolist()
     sized = model.is_sized and bool(box.free[AMPLITUDE])
@@ -300,7 +303,10 @@ def _optima(likelihood: Likelihood, theta: FloatArray, box: Box) -> tuple[list[O
         found = _follow(likelihood, _inside(begin, box), box, best)
         optima.append(found)
         if found.converged and found.log_likelihood > best:
-            best, plain = found.log_likelihood, _is_plain(found)
+            best = found.log_likelihood
+            # against a mere change of the level
+            alone = 0.5 * found.theta[AMPLITUDE] ** 2 * found.fisher[AMPLITUDE, AMPLITUDE]
+            plain = bool(min(best, alone) > PLAIN)
     if optima and (sized or (plain and model.rho > 0)):
         return _ranked(optima), sized
     return _ranked([*optima, _follow(likelihood, theta, box, best)]), True
@@ -339,7 +345,8 @@ def _judged(likelihood: Likelihood, best: Optimum, box: Box) -> _Found:
     """Compute goodness of fit and errors of an optimum."""
     derivatives = likelihood.derivatives(best.theta, box.free)
     chi2_reduced, p_value = goodness_of_fit(likelihood, best.theta, box.free, derivatives)
-    walls = _walls(best.theta, box)
+    to_wall = np.minimum(best.theta - box.lower, box.upper - best.theta)
+    walls = box.free & (to_wall < 1e-6 * (box.upper - box.lower))
     slope = abs(likelihood.model.scale.slope(float(best.theta[AMPLITUDE])))
     at = likelihood, best.theta, best.fisher, box.free, derivatives
     errors = precision(*at, walls=walls, slope=slope)
@@ -356,23 +363,27 @@ def _also_from(
 
 
 def _far(likelihood: Likelihood, box: Box, found: _Found) -> tuple[_Found, FloatArray | None]:
-    """Widen errors where the likelihood is no parabola; see `reach`."""
-    free = np.flatnonzero(box.free[:4])
+    """Widen errors by how far the likelihood has fallen three standard deviations away.
+
+    A parabola falls by t²/2 at t standard deviations, so that σ = d/√(2 Δℓ) at a distance d.  Each
+    place is moved to either side, while the other parameters follow it as they are correlated with
+    it; the larger of the errors of both sides counts, and that of the curvature where it is larger.
+    Gives a higher point as well, if one of these is.
+    """
+    free, best, sigma = np.flatnonzero(box.free[:4]), found.best, found.sigma.copy()
     places = free[free < AMPLITUDE]
     steps = np.zeros((places.size, 5))
     steps[:, free] = found.covariance[: places.size] / found.sigma[places, None]
     steps[:, AMPLITUDE] /= found.slope
-    sigma, higher = reach(likelihood, found.best, box, found.sigma, steps)
+    around = _inside(best.theta + AWAY * np.concatenate([-steps, steps]), box)
+    fallen = best.log_likelihood - likelihood.values(around)
+    lowest = int(np.argmin(fallen))
+    for k, theta, loss in zip([*places, *places], around, fallen.tolist(), strict=True):
+        if loss > 0:
+            sigma[k] = max(sigma[k], abs(theta[k] - best.theta[k]) / math.sqrt(2 * loss))
     factor = (sigma / found.sigma)[free]
-    return found._replace(
-        sigma=sigma, covariance=found.covariance * np.outer(factor, factor)
-    ), higher
-
-
-def _is_plain(found: Optimum) -> bool:
-    """Whether a particle is significant against a mere change of the level."""
-    alone = 0.5 * found.theta[AMPLITUDE] ** 2 * found.fisher[AMPLITUDE, AMPLITUDE]
-    return bool(min(found.log_likelihood, alone) > PLAIN)
+    wider = found._replace(sigma=sigma, covariance=found.covariance * np.outer(factor, factor))
+    return wider, around[lowest] if fallen[lowest] < 0 else None
 
 
 def _distinct(optima: list[Optimum], model: ForwardModel) -> list[Optimum]:
@@ -401,21 +412,6 @@ def _alternatives(optima: list[Optimum]) -> tuple[Alternative, ...]:
         for o in optima[1:]
     ]
     return tuple(sorted(others, key=lambda a: a.log_likelihood_gap))
-
-
-def _walls(theta: FloatArray, box: Box) -> BoolArray:
-    """Tell which free parameters ended at a limit of the box."""
-    near = np.minimum(theta - box.lower, box.upper - theta) < 1e-6 * (box.upper - box.lower)
-    return np.asarray(box.free & near)
-
-
-def _is_small(bias: FloatArray, sigma: FloatArray, box: Box, slope: float) -> bool:
-    """Whether no bias exceeds its error: an expansion has lost its meaning if its first term does.
-
-    The amplitude's error is in units of `slope` per unit of the amplitude.
-    """
-    sizes = np.abs(bias[:4]) * [1.0, 1.0, 1.0, slope]
-    return bool(np.all((sizes <= sigma) | ~box.free[:4]))
 
 
 def _at_bound(
@@ -544,39 +540,6 @@ def precision(
         likelihood.measured, level, derivatives, fisher, (free, moving), units
     )
     return found
-
-
-def reaches_far(likelihood: Likelihood, sigma: FloatArray) -> bool:
-    """Whether errors are so large that the curvature at the maximum may underestimate them.
-
-    Shapes: `sigma` (4,).
-    """
-    quarter = likelihood.model.fringe_nm / 4
-    return any(AWAY * error > quarter for error in sigma[:3].tolist())
-
-
-def reach(
-    likelihood: Likelihood, best: Optimum, box: Box, sigma: FloatArray, steps: FloatArray
-) -> tuple[FloatArray, FloatArray | None]:
-    """Errors by how far the likelihood has fallen three standard deviations away.
-
-    A parabola falls by t²/2 at t standard deviations, so that σ = d/√(2 Δℓ) at a distance d.  Each
-    place is moved to either side, while the other parameters follow it as they are correlated with
-    it; the larger of the errors of both sides counts, and that of the curvature where it is larger.
-
-    Shapes: `sigma` (4,), `steps` (n, 5), `higher` (5,).
-    """
-    away = AWAY * np.concatenate([-steps, steps])
-    around = np.minimum(np.maximum(best.theta + away, box.lower), box.upper)
-    fallen = best.log_likelihood - likelihood.values(around)
-    lowest = int(np.argmin(fallen))
-    higher = around[lowest] if fallen[lowest] < 0 else None
-    wider = sigma.copy()
-    places = np.flatnonzero(box.free[:3]).tolist()
-    for k, theta, loss in zip([*places, *places], around, fallen.tolist(), strict=True):
-        if loss > 0:
-            wider[k] = max(wider[k], abs(theta[k] - best.theta[k]) / math.sqrt(2 * loss))
-    return wider, higher
 
 
 def compile_kernels(model: ForwardModel, *, heights: bool, posteriors: bool = False) -> None:

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from iscat_analysis._kernels import ComplexArray
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis import calibrated
 from iscat_analysis.errors import ConfigError, DataError
@@ -244,20 +245,11 @@ class _Waves:
         both = (up[:, None] * along[None]).reshape(-1, self.qx.size)
         return np.concatenate([both.real, both.imag[:, 1:]], axis=1)
 
-    def slopes(self, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Coefficients of the derivatives along x and y."""
+    def times(self, coefficients: FloatArray, factor: ComplexArray) -> FloatArray:
+        """Coefficients of the picture whose waves are multiplied by complex factors."""
         n = self.qx.size
         cos, sin = coefficients[:n], np.concatenate([[0.0], coefficients[n:]])
-        out = []
-        for q in (self.qx, self.qy):
-            out.append(np.concatenate([q * sin, (-q * cos)[1:]]))
-        return out[0], out[1]
-
-    def moved(self, coefficients: FloatArray, x_nm: float, y_nm: float) -> FloatArray:
-        """Coefficients of the picture with (x, y) in the place of the origin."""
-        n = self.qx.size
-        cos, sin = coefficients[:n], np.concatenate([[0.0], coefficients[n:]])
-        turned = (cos - 1j * sin) * np.exp(1j * (self.qx * x_nm + self.qy * y_nm))
+        turned = (cos - 1j * sin) * factor
         return np.concatenate([turned.real, -turned.imag[1:]])
 
 
@@ -327,7 +319,8 @@ class PictureFitter:
         data determine.
         """
         began, scale = bool(np.any(coefficients)), peak_per_amplitude(self.nominal)
-        slopes = waves.slopes(coefficients)
+        # along x and y
+        slopes = [waves.times(coefficients, 1j * q) for q in (waves.qx, waves.qy)]
 
         def one(image: ParticleImage) -> tuple[FloatArray, FloatArray]:
             grid, strength, gain = image.grid, image.mass_kda * scale, math.exp(image.level)
@@ -426,7 +419,7 @@ def _gauge(
     pattern = (waves.on(axis, axis, None) @ coefficients).reshape(axis.size, axis.size)
     energy = pattern**2 / np.sum(pattern**2)
     x, y = float(energy.sum(axis=0) @ axis), float(energy.sum(axis=1) @ axis)
-    centred = waves.moved(coefficients, x, y)
+    centred = waves.times(coefficients, np.exp(1j * (waves.qx * x + waves.qy * y)))
     pattern = (waves.on(axis, axis, None) @ centred).reshape(axis.size, axis.size)
     row, column = np.unravel_index(int(np.argmax(np.abs(pattern))), pattern.shape)
     fine = step_nm * np.linspace(-1, 1, 17)  # where the peak is looked for

@@ -131,8 +131,10 @@ class Response:
         Shapes: `derivative` (ny, nx).
         """
         theta = self.theta(self.model.height_nm if z_nm is None else z_nm, amplitude)
-        further = self._along_index(theta) if index else []
-        others = [derivative, *further]
+        others = [derivative]
+        if index and isinstance(self.model, SizedModel):
+            values = (*theta[:4], self.model.sphere.index.real)
+            others.append(SphereOfIndex(self.model).signal(self.grid, values)[1][-1])
         whole = joint_information(self.expected(theta), theta, self.names, others)
         count, all_others = 1 + len(self.names), len(others) + len(self.names)
         shared = np.delete(np.arange(all_others), np.arange(1, len(others)))
@@ -141,7 +143,7 @@ class Response:
         information = eliminated(whole, count)
         optics = self._learned(information[1:, 1:], information[1:, 0])
         moved = imitation(whole, count)
-        row = len(further) + int(np.flatnonzero(self._kept == PARAMETERS.index("mass_kda"))[0])
+        row = len(others) - 1 + int(np.flatnonzero(self._kept == PARAMETERS.index("mass_kda"))[0])
         left = 1 - float(information[0, 1:] @ optics) / float(information[0, 0])
         return Shifts(float(moved[row, 1:] @ optics - moved[row, 0]) / amplitude, optics, left)
 
@@ -177,15 +179,6 @@ class Response:
         rows = self.expected(theta).derivatives(theta)
         # rows of ∂xx and ∂yy
         return self.to_input((rows[:, 5] + rows[:, 7]) / 2, amplitude)
-
-    def _along_index(self, theta: FloatArray) -> list[FloatArray]:
-        """Differentiate the picture of a sphere along its index, (1, ny, nx)."""
-        if not isinstance(self.model, SizedModel):
-            raise TypeError(f"{type(self.model).__name__} has no index")
-        x, y, z, amplitude, _ = theta.tolist()
-        known = self.model.sphere.index.real
-        slopes = SphereOfIndex(self.model).signal(self.grid, (x, y, z, amplitude, known))[1]
-        return [slopes[-1]]
 
     @property
     def _kept(self) -> NDArray[np.intp]:
