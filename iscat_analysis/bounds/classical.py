@@ -17,13 +17,6 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood, ModelLikelihood
 from iscat_analysis.records import PARAMETERS, FloatArray
 
-SINGULAR = 1e-9
-"""Eigenvalue of the normalised Fisher matrix that counts as zero.
-
-It is the squared angle between the derivatives; below it the angle is less than a hundred times the
-3e-7 to which the image's gradient is known, and an inverse would report that error."""
-
-
 LEAST_COMPONENT = 1e-3
 """Component of an unidentifiable direction below which a parameter is not part of it."""
 
@@ -120,7 +113,10 @@ def bounds_from_matrices(
         )
     scale = single[visible]
     values, vectors = np.linalg.eigh(fisher[np.ix_(visible, visible)] * np.outer(scale, scale))
-    null = values < SINGULAR
+    # An eigenvalue that counts as zero: the squared angle between the derivatives.  Below it the
+    # angle is less than a hundred times the 3e-7 to which the gradient of the image is known, and
+    # an inverse would report that error.
+    null = values < 1e-9
     for vector in vectors.T[null]:
         step = vector * scale
         parts = [k for k in range(len(visible)) if abs(vector[k]) > LEAST_COMPONENT]

@@ -251,9 +251,6 @@ TARGETS = {"x": "x_nm", "y": "y_nm", "z": "z_nm", "mass": "mass_kda"}
 FOCUS_REACH_NM = 2000.0
 """Foci searched on either side of the particle [nm]."""
 
-FOCUS_STEP_NM = 25.0
-"""Grid of the search; the bound changes over half a wavelength and more [nm]."""
-
 ATTENUATION_DECADES = 4
 """Attenuations searched below 1."""
 
@@ -290,7 +287,8 @@ def optimize(
     column = f"crb_joint_{parameter}"
     if axis == "focus":
         height = config.particle.nominal_height_nm
-        grid = height + np.arange(-FOCUS_REACH_NM, FOCUS_REACH_NM + 1, FOCUS_STEP_NM)
+        # grid of the search; the bound changes over half a wavelength and more
+        grid = height + np.arange(-FOCUS_REACH_NM, FOCUS_REACH_NM + 1, 25.0)
         note = "light on the particle held; the oil thickness follows the focus"
     else:
         grid = np.logspace(-ATTENUATION_DECADES, 0, 20 * ATTENUATION_DECADES + 1)

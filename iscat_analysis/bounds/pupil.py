@@ -54,9 +54,6 @@ KNOBS: Mapping[str, tuple[str, ...]] = {
 """What can be searched, and the keys of ``[optics]`` it stands for."""
 
 
-BUDGET = 70
-"""Evaluations that one descent may take for each of its variables."""
-
 RADII = (0.3, 2e-3)
 """First and last step of a descent; a unit is a radian, 500 nm of focus, λ/20 rms of a Zernike
 term, a factor e of attenuation, the whole aperture for the mask."""
@@ -183,7 +180,8 @@ class Search:
         limits = [self.knobs[key].allowed for key in keys]
         first, last = RADII
         options = {"initial_tr_radius": first, "final_tr_radius": last}
-        options["maxfev"] = BUDGET * len(keys)
+        # evaluations that one descent may take for each of its variables
+        options["maxfev"] = 70 * len(keys)
         begin = np.clip(start, *np.transpose(limits))
         found = scipy.optimize.minimize(at, begin, bounds=limits, method="COBYQA", options=options)
         return self.value(self.decode(keys, found.x))

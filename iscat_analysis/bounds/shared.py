@@ -35,7 +35,7 @@ from iscat_analysis.findings.setup import FAINT_PICTURES, PICTURES_LEFT_OUT
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.maximiser import eliminated, imitation
-from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, ForwardModel, forward_model
+from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, ForwardModel, PixelGrid, forward_model
 from iscat_analysis.optics.parameters import (
     FAINTEST,
     FREE,
@@ -46,7 +46,6 @@ from iscat_analysis.optics.parameters import (
     prior_of,
     settings_of,
 )
-from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
 from iscat_analysis.threads import one_thread_algebra
 

@@ -28,8 +28,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.inference.checks import mask_of, pixels_of
 from iscat_analysis.inference.laws import CONDITIONAL, POISSON, NoiseLaw, law_named
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.optics.model import ForwardModel
-from iscat_analysis.optics.pixels import PixelGrid
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.records import BoolArray, FloatArray
 
 KNOWN, MEAN, MEDIAN = 0.0, 1.0, math.pi / 2

@@ -56,8 +56,7 @@ from iscat_analysis.inference.sizes import (
     size_probability,
     starts_of,
 )
-from iscat_analysis.optics.model import ForwardModel
-from iscat_analysis.optics.pixels import PixelGrid
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.records import (
     FREE_PARAMETERS,

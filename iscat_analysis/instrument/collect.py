@@ -36,9 +36,8 @@ from iscat_analysis.instrument.particle_image import (
     contrast_of,
 )
 from iscat_analysis.movie import Stack
-from iscat_analysis.optics.model import ForwardModel
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.optics.parameters import FAINTEST, LEAST_IMAGES, MOST_IMAGES, settings_of
-from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.records import FloatArray, Windows
 from iscat_analysis.search.bright import (
     ALONE_NM,

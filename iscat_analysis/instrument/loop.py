@@ -60,10 +60,6 @@ from iscat_analysis.optics.parameters import (
 )
 from iscat_analysis.records import FloatArray, Mapper, Status, Windows
 
-STEP_FACTORS = (0.5, 2.0)
-"""How much smaller or larger than said the steps of a scan may turn out."""
-
-
 _OPTICS_PASSES = 8
 
 
@@ -109,7 +105,8 @@ def _search(seen: Collected, groups: Sequence[str], mapper: Mapper) -> OpticsSea
     limits = optics_limits(config.optics.n_immersion, config.optics.n_glass)
     if seen.focus_step_nm is not None:
         configured[FOCUS_STEP] = seen.focus_step_nm
-        low, high = sorted(factor * seen.focus_step_nm for factor in STEP_FACTORS)
+        # how much smaller or larger than said the steps of a scan may turn out
+        low, high = sorted(factor * seen.focus_step_nm for factor in (0.5, 2.0))
         limits[FOCUS_STEP] = (low, high)
     configured |= {name: 0.0 for name in (*MOVES, *FIELD) if name in (seen.near or {})}
     build, wide = microscopes(config, max(map(reach_nm, images))), rings_of(config, images[0])
@@ -258,10 +255,6 @@ def _best_heights(
     return [fit for *_, fit in best], [chi2 for _, chi2, _ in best]
 
 
-SETTLED = 1.0
-"""Standard errors that are still to come, below which no other round is made."""
-
-
 class PictureSource(Protocol):
     """Where pictures of particles come from: landings, a field before and after, tracks, a scan."""
 
@@ -399,7 +392,8 @@ class Rounds:
         """Whether other rounds would change nothing worth the time."""
         last, rest = self._steps[-1], self.to_come
         weight = np.linalg.pinv(last.found.covariance, hermitian=True)
-        return last.same_kind and float(rest @ weight @ rest) < SETTLED**2
+        # standard errors that are still to come, below which no other round is made
+        return last.same_kind and float(rest @ weight @ rest) < 1.0
 
     @property
     def next(self) -> Config | None:
@@ -430,12 +424,6 @@ def _kind(settings: Settings) -> tuple[object, ...]:
 
 ROUNDS = 3
 """Of a fit of the field and optics learned from it."""
-
-
-HOPELESS_CHI2 = 2.0
-"""Reduced χ² of pictures that were not fitted, above which it must have fallen for another round.
-Not more than that: with the first optics heights may be those of two fringes, and the field that is
-fitted with the next ones has a single one."""
 
 
 @dataclass(frozen=True)
@@ -509,7 +497,10 @@ class WholeField:
             return False
         before = misfit_of(fitted[-2]) if len(fitted) > 1 else math.inf
         before = min(before, float(fitted[-1].measured.configured.chi2_reduced.mean()))
-        hopeless = misfit_of(fitted[-1]) > max(HOPELESS_CHI2, before)
+        # Reduced χ² above which it must have fallen for another round. Not more than that: with the
+        # first optics heights may be those of two fringes, and the field that is fitted with the
+        # next ones has a single one.
+        hopeless = misfit_of(fitted[-1]) > max(2.0, before)
         return fitted[-1].accepted or hopeless or len(fitted) == ROUNDS
 
 

@@ -169,11 +169,9 @@ def _best_phase(
 
 def same_state(one: Estimate, other: Estimate) -> bool:
     """Tell whether two microscopes have the same polarisation, and both a mask or none."""
-    return _state(one.values) == _state(other.values)
-
-
-def _state(values: Settings) -> tuple[str, bool]:
-    return str(values["polarization"]), bool(values["mask_na"] > 0)
+    first, second = one.values, other.values
+    masks = first["mask_na"] > 0, second["mask_na"] > 0
+    return first["polarization"] == second["polarization"] and masks[0] == masks[1]
 
 
 HELD_OUT = 3
@@ -182,11 +180,6 @@ HELD_OUT = 3
 
 TWIN_GAP = math.log(1000.0)
 """Log-likelihood by which a twin must be worse to be ruled out: odds of 1000."""
-
-
-WORSE_GAP = 20.0
-"""Log-likelihood by which the configured optics may describe pictures that were not fitted better:
-the noise of the fitted parameters costs less."""
 
 
 HELD_OUT_P = 1e-3
@@ -354,7 +347,8 @@ class OpticsSearch:
         again = with_masses(judged.images, self.build, self.configured)
         nominal = self.fit(again, self.configured, ())
         configured = judge(nominal.images, self.build, self.configured, self.mapper)
-        worse = nominal.log_likelihood - judged.log_likelihood > WORSE_GAP
+        # by less the configured optics may be better: the noise of the fitted parameters costs less
+        worse = nominal.log_likelihood - judged.log_likelihood > 20.0
         images = (*best.images, *judged.images) if held_out else best.images
         final = self.fit(images, best.values, best.names)
         refusals = self._refusals(final, judgement, twin, worse=worse)

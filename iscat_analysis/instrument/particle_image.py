@@ -16,10 +16,9 @@ from iscat_analysis.inference.heights import height_prior
 from iscat_analysis.inference.laws import CONDITIONAL, NoiseLaw
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.last_used import memoize
-from iscat_analysis.optics.forward import ForwardModel, forward_model, peak_per_amplitude
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model, peak_per_amplitude
 from iscat_analysis.optics.local import WEIGHTS, Spot, changes_at
 from iscat_analysis.optics.parameters import FOCUS_STEP, Settings, with_settings
-from iscat_analysis.optics.pixels import PixelGrid
 from iscat_analysis.records import BoolArray, FloatArray
 
 PRIVATE = 5

@@ -420,9 +420,6 @@ def _brief(species: pd.DataFrame, window_frames: int | None) -> Finding | None:
     return BRIEF_VISITORS({"frames": count(window_frames, "frame"), "residence": residence})
 
 
-HISTOGRAM_COLUMNS = ("low_kda", "high_kda", "count", "count_low", "count_high")
-"""Columns of `Distribution.histogram`."""
-
 CURVE_COLUMNS = ("mass_kda", "density", "density_se", "model", "model_corrected", "efficiency")
 """Columns of `Distribution.curves`."""
 
@@ -455,8 +452,9 @@ def histogram_of(events: Events) -> pd.DataFrame:
     """Count, with 95 % intervals."""
     edges = _edges(events) if events.x.size else np.zeros(1)
     counts = np.histogram(events.x, edges)[0]
-    columns = edges[:-1], edges[1:], counts, *poisson_interval(counts)
-    return pd.DataFrame(dict(zip(HISTOGRAM_COLUMNS, columns, strict=True)))
+    columns = {"low_kda": edges[:-1], "high_kda": edges[1:], "count": counts}
+    columns["count_low"], columns["count_high"] = poisson_interval(counts)
+    return pd.DataFrame(columns)
 
 
 def mean_density(events: Events, best: Mixture, x: FloatArray) -> FloatArray:

@@ -55,9 +55,6 @@ from iscat_analysis.units import count
 UNIT_NM = 1e-3
 """Diameters are taken over this length, so that every logarithm is positive, as `Events` asks."""
 
-LARGEST_SKEW = 0.3
-"""p σ_d/d from which the likelihood of a diameter is not known well enough."""
-
 LARGEST_ERROR = 0.5
 """Relative error from which a diameter says nothing."""
 
@@ -213,5 +210,6 @@ def _doubts(known: BoolArray, skew: FloatArray) -> Iterator[Finding]:
     if left_out := int(np.count_nonzero(~known)):
         amount = count(left_out, "sphere")
         yield SPHERES_LEFT_OUT({"amount": amount, "percent": 100 * LARGEST_ERROR})
-    if np.median(np.abs(skew)) > LARGEST_SKEW:
+    # p σ_d/d from which the likelihood of a diameter is not known well enough
+    if np.median(np.abs(skew)) > 0.3:
         yield LARGE_DIAMETER_ERRORS()

@@ -412,9 +412,6 @@ def refractive_index(
     return np.asarray(found), np.asarray(sigma)
 
 
-TESTED_POSITIONS = 300
-"""Positions of a track whose motion is tested, from its first: the time of a test grows fast."""
-
 SURPRISING = 0.005
 """A p-value this small is remarked on: of free tracks one or two in a hundred, with three tests."""
 
@@ -668,7 +665,8 @@ def _motions(
 
 def _tests(whole: Displacements, rng: np.random.Generator) -> dict[str, float]:
     """Test whether the motion is free; two of the tests use the first positions of long tracks."""
-    track = stretch_of(whole, slice(TESTED_POSITIONS))
+    # the first 300: the time of a test grows fast
+    track = stretch_of(whole, slice(300))
     # few resamples first; three that are as surprising leave no doubt
     walls = well_of(track, 19, 3, rng)
     if walls.p_value <= 0.1:

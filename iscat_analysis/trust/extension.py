@@ -43,9 +43,6 @@ from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.records import BoolArray, FloatArray, Status, has_only
 from iscat_analysis.trust.response import response_of
 
-FEWEST = 6
-"""Events without which no spread is called common to all particles."""
-
 _SIGNIFICANT = 4.0  # standard errors of the mean variance beyond which all particles have it
 _CHANCE = 1e-5  # probability that the image of a point is flagged
 _OUTLIER_SIGMAS = 4.0  # standard errors beyond which an event is not one of many
@@ -115,7 +112,8 @@ class Extension:
         moved, moved_se = _wiggle(table[many], in_time, config.particle.wiggle_nm)
         found = ((mean, mean / error), (length_nm2, sigmas), (moved, moved / moved_se))
         clear = [variance for variance, beyond in found if beyond > _SIGNIFICANT]
-        is_common = bool(clear and many.sum() >= FEWEST)
+        # events without which no spread is called common to all particles
+        is_common = bool(clear and many.sum() >= 6)
         prior_sd = config.uncertainty.wiggle_nm
         if is_common:  # a narrow prior would pull a clear width towards zero
             # standard deviation of the prior over a √v that is clear
