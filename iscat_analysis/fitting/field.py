@@ -391,10 +391,14 @@ def search_field(
     fresh: list[Candidate] = []
     doubtful: list[Candidate] = []
     for candidate in found:
-        size = max(
-            (_misfit(candidate, event, context, near, explains) for event in events), default=0.0
-        )
-        size = max(size, EXCEEDS * candidate.beside)
+        size = EXCEEDS * candidate.beside
+        for event in events:
+            here = event.candidate
+            distance = math.hypot(candidate.x_px - here.x_px, candidate.y_px - here.y_px)
+            if distance <= near:
+                size = math.inf
+            elif distance <= _reach_px(context) and Status.POOR_FIT in event.fit.flags:
+                size = max(size, math.sqrt(explains * _chi2_left(event)))
         if abs(candidate.snr) > size:
             fresh.append(candidate)
         elif not is_hidden(candidate.snr, size):
@@ -402,26 +406,10 @@ def search_field(
     return fresh, doubtful
 
 
-def _misfit(
-    candidate: Candidate, event: Fitted, context: AnalysisContext, near_px: float, explains: float
-) -> float:
-    """Signal-to-noise ratio that a candidate must exceed not to be a residual of a fit."""
-    here = event.candidate
-    distance = math.hypot(candidate.x_px - here.x_px, candidate.y_px - here.y_px)
-    if distance <= near_px:
-        return math.inf
-    return math.sqrt(explains * _excess(event)) if distance <= _reach_px(context) else 0.0
-
-
 def _reach_px(context: AnalysisContext) -> float:
     """Distance from a particle within which a poor fit leaves residuals [pixels]."""
     # In dark field a wrong background level leaves residuals beyond the fitted region.
     return (2 if context.additive else 0.75) * context.roi_px
-
-
-def _excess(event: Fitted) -> float:
-    """χ² of a fit beyond its expectation, where the fit is poor."""
-    return _chi2_left(event) if Status.POOR_FIT in event.fit.flags else 0.0
 
 
 def _chi2_left(event: Fitted) -> float:

@@ -176,24 +176,6 @@ def _in_field(steps: Iterable[BrightStep], tile: Tile | None) -> list[BrightStep
     return [step for step in moved if tile.holds(np.array(step.y_px), np.array(step.x_px))]
 
 
-def _neighbours(
-    step: BrightStep, others: Sequence[BrightStep], config: Config
-) -> tuple[tuple[int, float], ...]:
-    """List the steps whose rings change while a step's frames are summed, and by what share."""
-    found = []
-    for number, other in enumerate(others):
-        apart = math.hypot(step.x_px - other.x_px, step.y_px - other.y_px) * _pixel_nm(config)
-        if apart > RINGS_NM or (abs(step.frame - other.frame) < 5 and apart < SAME_NM):
-            continue
-        shares = [
-            (stop - min(max(other.frame, start), stop)) / max(stop - start, 1)
-            for start, stop in (step.frames_before, step.frames_after)
-        ]
-        if shares[1] > shares[0]:
-            found.append((number, shares[1] - shares[0]))
-    return tuple(found)
-
-
 def _standards(bright: Sequence[BrightStep]) -> list[BrightStep]:
     """Leave out what is far brighter than the others: a vesicle or an aggregate is no point.
 
@@ -386,14 +368,24 @@ def _bright(images: Iterable[ParticleImage]) -> Images:
 def _particle_image_of(
     step: BrightStep, others: Sequence[BrightStep], config: Config, model: ForwardModel
 ) -> ParticleImage:
-    """Make an image of a step among others."""
+    """Make an image of a step among others, whose rings may change while its frames are summed."""
     grid = PixelGrid.region(step.rows, step.columns, _pixel_nm(config))
     reads = step.n_before * step.read_variance_e2, step.n_after * step.read_variance_e2
     counts = step.before_e, step.after_e, step.power_ratio * step.motion
     likelihood = conditional(model, grid, *counts, read_variances_e2=reads, masked=~step.usable)
     frames = sum(step.frames_before) / 2, sum(step.frames_after) / 2
-    near = _neighbours(step, others, config)
-    return replace(_centred(likelihood, config), frames=frames, neighbours=near)
+    near = []
+    for number, other in enumerate(others):
+        apart = math.hypot(step.x_px - other.x_px, step.y_px - other.y_px) * grid.pixel_nm
+        if apart > RINGS_NM or (abs(step.frame - other.frame) < 5 and apart < SAME_NM):
+            continue
+        before, after = (
+            (stop - min(max(other.frame, start), stop)) / max(stop - start, 1)
+            for start, stop in (step.frames_before, step.frames_after)
+        )
+        if after > before:
+            near.append((number, after - before))
+    return replace(_centred(likelihood, config), frames=frames, neighbours=tuple(near))
 
 
 def _pixel_nm(config: Config) -> float:

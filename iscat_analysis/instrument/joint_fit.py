@@ -12,7 +12,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,7 +108,12 @@ def maximise(
             converged = True
             break
         shared, own = at.step(names, damping)
-        trial_values = _limited(values, names, shared, limits or {})
+        trial_values = dict(values)
+        for name, move in zip(names, shared, strict=True):
+            ends = (limits or {}).get(name, (-math.inf, math.inf))
+            trial_values[name] = float(np.clip(values[name] + move, *ends))
+        if "mask_na" in names:
+            trial_values["mask_na"] = min(trial_values["mask_na"], trial_values["na"] - MASK_NA)
         moved = np.clip(private + own, *joint.walls)
         trial = joint.at(trial_values, moved)
         used += 1
@@ -237,21 +241,6 @@ class JointLikelihood:
             -changes / errors,
             errors**-2.0,
         )
-
-
-def _limited(
-    values: Settings,
-    names: Sequence[str],
-    step: FloatArray,
-    limits: Mapping[str, tuple[float, float]],
-) -> dict[str, Any]:
-    """Take a step and stay inside the limits."""
-    out = dict(values)
-    for name, move in zip(names, step, strict=True):
-        out[name] = float(np.clip(values[name] + move, *limits.get(name, (-math.inf, math.inf))))
-    if "mask_na" in names:
-        out["mask_na"] = min(out["mask_na"], out["na"] - MASK_NA)
-    return out
 
 
 @dataclass(frozen=True)

@@ -532,20 +532,17 @@ def adopted(
     if learned is None:
         return _as_configured(config, {**tested, **_told(found)}, verdict, why)
     if learned.optics.reference_phase_deg != found.config.optics.reference_phase_deg:
-        found = found.with_phase(learned.optics.reference_phase_deg, _turned(config))
+        line = config.calibration
+        expected, other = "brighten", "darken"
+        if line is not None and line.gradient_per_kda < 0:
+            expected, other = other, expected
+        turned = of.TURNED_PHASE({"expected": expected, "found": other})
+        found = found.with_phase(learned.optics.reference_phase_deg, turned)
     said = of.OPTICS_LEARNED({"headline": found.headline(picture_of)})
     values = {name: found.value(name) for name in found.names}
     errors = _with_errors(values, found.covariance, learned.optics.field_px)
     summary = {**tested, **_told(found), **errors, "calibrated": True}
     return Learned(learned, summary, (said, *found.notes))
-
-
-def _turned(config: Config) -> Finding:
-    """Say why the phase is not the one that was found, and what that may mean for masses."""
-    line = config.calibration
-    dark = line is not None and line.gradient_per_kda < 0
-    expected, found = ("darken", "brighten") if dark else ("brighten", "darken")
-    return of.TURNED_PHASE({"expected": expected, "found": found})
 
 
 def calibrate_movie(
@@ -675,7 +672,8 @@ def wrong_sign(config: Config) -> WrongSign | None:
         return None
     line = config.calibration.gradient_per_kda
     foci = sorted({*_FOCI_NM, config.optics.focus_nm})
-    contrast = {focus: _contrast(_at(config, focus)) for focus in foci}
+    bare = config.model_copy(update={"calibration": None})
+    contrast = {focus: signed_peak(forward_model(_at(bare, focus), 1000.0)) for focus in foci}
     here = contrast[config.optics.focus_nm]
     most = max(foci, key=lambda focus: abs(contrast[focus]))
     share = abs(here / contrast[most])
@@ -780,7 +778,3 @@ def _found(recording: Recording, seen: Collected) -> OpticsCalibration:
 def _at(config: Config, focus_nm: float) -> Config:
     optics = config.optics.model_copy(update={"focus_nm": focus_nm})
     return config.model_copy(update={"optics": optics})
-
-
-def _contrast(config: Config) -> float:
-    return signed_peak(forward_model(config.model_copy(update={"calibration": None}), 1000.0))

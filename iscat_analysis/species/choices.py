@@ -267,7 +267,9 @@ def fit_species(
     """Fit 1, 2, … components, on a background; stop after two numbers without a better BIC."""
     fits: list[Mixture] = []
     for k in range(1, min(max_species, max(1, events.x.size // 5)) + 1):
-        start = _spread_start(events, k)
+        parts = np.array_split(np.sort(events.x), k)  # equal shares of the sorted events
+        variance = np.array([max(part.var(), 1e-12) for part in parts])
+        start = Mixture(np.full(k, 1 / k), np.array([part.mean() for part in parts]), variance)
         if background:
             start = start.on_background(*broad(events), FIRST_SHARE)
         starts = [start, *(split_starts(events, fits[-1]) if fits else ())]
@@ -383,14 +385,6 @@ def _valleys(weight: FloatArray, mean: FloatArray, whole: FloatArray) -> FloatAr
     density = _density(grid, weight, mean, whole**2)
     high = np.flatnonzero((density[1:-1] > density[:-2]) & (density[1:-1] >= density[2:])) + 1
     return np.array([grid[i + int(np.argmin(density[i:j]))] for i, j in pairwise(high)])
-
-
-def _spread_start(events: Events, k: int) -> Mixture:
-    """Equal shares of the sorted events."""
-    parts = np.array_split(np.sort(events.x), k)
-    mean = np.array([part.mean() for part in parts])
-    variance = np.array([max(part.var(), 1e-12) for part in parts])
-    return Mixture(np.full(k, 1 / k), mean, variance)
 
 
 def split_starts(events: Events, fit: Mixture) -> list[Mixture]:

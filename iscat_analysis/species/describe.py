@@ -474,15 +474,20 @@ def curves_of(events: Events, best: Mixture, bandwidth: float) -> pd.DataFrame:
     mass = np.linspace(0.0, _reach(events), POINTS)
     z = (mass[:, np.newaxis] - events.x) / bandwidth
     kernel = np.exp(-0.5 * z**2) / (math.sqrt(2 * math.pi) * bandwidth)
-    arrived = best.arrived(events) * mean_density(events, best, mass)
+    arrived, seen = best.arrived(events) * mean_density(events, best, mass), np.ones(mass.shape)
+    efficiency = seen
+    if (limit := events.efficiency) is not None:  # of a measured mass, averaged over its noise
+        extra = np.maximum(limit.extra_sigma(np.quantile(events.sigma, _NOISES)), 1e-9)
+        at = mass[:, np.newaxis] - np.maximum(limit.threshold_kda, 0.0)
+        seen, efficiency = ndtr(at / extra).mean(axis=1), limit(mass)
     return pd.DataFrame(
         {
             "mass_kda": mass,
             "density": kernel.sum(axis=1),
             "density_se": np.sqrt(np.sum(kernel**2, axis=1)),
-            "model": arrived * _selected(events, mass),
+            "model": arrived * seen,
             "model_corrected": arrived,
-            "efficiency": events.efficiency(mass) if events.efficiency else np.ones(mass.shape),
+            "efficiency": efficiency,
         }
     )
 
@@ -502,12 +507,3 @@ def _edges(events: Events) -> FloatArray:
     )
     width = round_width(wanted)
     return np.asarray(np.arange(math.ceil(reach / width) + 1) * width)
-
-
-def _selected(events: Events, x: FloatArray) -> FloatArray:
-    """Probability that an event of measured mass x was detected, averaged over its noise."""
-    if events.efficiency is None:
-        return np.ones(x.shape)
-    extra = events.efficiency.extra_sigma(np.quantile(events.sigma, _NOISES))
-    at = x[:, np.newaxis] - np.maximum(events.efficiency.threshold_kda, 0.0)
-    return np.asarray(ndtr(at / np.maximum(extra, 1e-9)).mean(axis=1))

@@ -61,7 +61,6 @@ _RANGES = {
 }  # fmt: skip
 """The columns of numbers that are used, and how large their magnitudes can be."""
 
-_OF_EVENTS = ("mass_kda", "sigma_kda", "frame", "x_px", "y_px")
 _REJECTED = "rejected_by_hand"  # true of events that somebody left out
 _NAMED = 3  # tables that a note names
 
@@ -185,7 +184,11 @@ def event_table(
     table = _checked(table)
     found, efficiency = _usable(table, called, sigma_kda), None
     if above_kda is not None:
-        found = _cut(found, above_kda)
+        kept = np.abs(found.mass_kda) > above_kda
+        if not kept.any():
+            raise DataError(f"{called}: no event lies above `above_kda` = {above_kda:g}")
+        columns = ("mass_kda", "sigma_kda", "frame", "x_px", "y_px")
+        found = replace(found, **{name: getattr(found, name)[kept] for name in columns})
         efficiency = _sharp(above_kda)
     elif limit_kda is not None:
         spread = limit_sigma_kda or float(np.median(found.sigma_kda))
@@ -315,14 +318,6 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
     mass, sigma, frame, x, y = (values[known] for values in (mass, sigma, frame, x, y))
     found = EventTable(name, mass, sigma, frame, x, y, scale_error=shared_error(rows))
     return replace(found, window_frames=window_frames, findings=told)
-
-
-def _cut(found: EventTable, above_kda: float) -> EventTable:
-    """Leave out the events below a mass."""
-    kept = np.abs(found.mass_kda) > above_kda
-    if not kept.any():
-        raise DataError(f"{found.name}: no event lies above `above_kda` = {above_kda:g}")
-    return replace(found, **{name: getattr(found, name)[kept] for name in _OF_EVENTS})
 
 
 def _sharp(edge_kda: float) -> Efficiency:

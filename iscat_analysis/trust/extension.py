@@ -105,7 +105,12 @@ class Extension:
             return None
         left, per_mass = 1.0, None
         if config.optics.are_learned:
-            left, per_mass = _beside_learned_optics(config, table)
+            respond = response_of(config, table)
+            scale = forward_model(config, respond.model.reach_nm).scale
+            usual = float(scale.amplitudes(float(table["mass_kda"].abs().median())))
+            shifts = respond.to_width(usual)
+            # of a width that learned optics do not imitate; less is rounding
+            left, per_mass = max(shifts.left, 1e-3), abs(shifts.amplitude)
         mean, error = _mean(q[many], se[many])
         mean, error = mean / left, error / left
         length_nm2, sigmas, shows_length = _length(*(part[many] for part in evidence[7:10]))
@@ -201,15 +206,6 @@ def _of_a_share(log_likelihood: LogLikelihood, v: FloatArray) -> FloatArray:
 
 def _normal(mean: float, error: float) -> LogLikelihood:
     return lambda v: -0.5 * ((v - mean) / error) ** 2
-
-
-def _beside_learned_optics(config: Config, table: pd.DataFrame) -> tuple[float, float]:
-    """Share of a width that learned optics do not imitate, and the mass lost per variance."""
-    respond = response_of(config, table)
-    scale = forward_model(config, respond.model.reach_nm).scale
-    shifts = respond.to_width(float(scale.amplitudes(float(table["mass_kda"].abs().median()))))
-    # share of a width that learned optics do not imitate; less is rounding
-    return max(shifts.left, 1e-3), abs(shifts.amplitude)
 
 
 def _mean(q: FloatArray, se: FloatArray) -> tuple[float, float]:
