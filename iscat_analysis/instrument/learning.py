@@ -639,9 +639,6 @@ def _told(found: OpticsCalibration) -> dict[str, Any]:
     return {key: told[key] for key in ("accepted", "refusals", "parameters", "twin", "notes")}
 
 
-_FOCI_NM = tuple(float(focus) for focus in range(-800, 801, 50))
-
-
 @dataclass(frozen=True)
 class WrongSign:
     """A configured focus that gives the contrast the other sign.
@@ -671,7 +668,7 @@ def wrong_sign(config: Config) -> WrongSign | None:
         forward_model(config, 1000.0)
         return None
     line = config.calibration.gradient_per_kda
-    foci = sorted({*_FOCI_NM, config.optics.focus_nm})
+    foci = sorted({*np.arange(-800.0, 801.0, 50.0).tolist(), config.optics.focus_nm})
     bare = config.model_copy(update={"calibration": None})
     contrast = {focus: signed_peak(forward_model(_at(bare, focus), 1000.0)) for focus in foci}
     here = contrast[config.optics.focus_nm]

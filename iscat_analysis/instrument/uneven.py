@@ -24,7 +24,6 @@ from iscat_analysis.fitting.ranges import background_mode, fitted_frames
 from iscat_analysis.instrument.joint_fit import Estimate, PictureScores, maximise
 from iscat_analysis.instrument.measure import HELD_OUT
 from iscat_analysis.instrument.particle_image import (
-    Build,
     Collected,
     Images,
     microscopes,
@@ -53,6 +52,8 @@ Movies that need each: drift, bend and jumps in `tests/diagnosis/test_focus_drif
 but for a tilted phase, in `tests/instrument/test_uneven_optics.py`; `benchmarks/hazards.py` has a
 row for a tilted focus.
 """
+
+_TERMS = tuple(chain.from_iterable(KINDS.values()))
 
 JUMP = "the focus jumps"
 """The same of one more jump, at the frame at which the pictures ask for it most."""
@@ -185,7 +186,9 @@ def asked_change(
         return NO_CHANGE
     build = microscopes(config, max(map(reach_nm, images)))
     # free beside a change before optics are learned
-    tests = _ScoreTests.of(seen, build, settings, ("focus_nm", "reference_phase_deg"), view, mapper)
+    shared = ("focus_nm", "reference_phase_deg")
+    scores = PictureScores.of(seen, build, settings, (*shared, *_TERMS), mapper)
+    tests = _ScoreTests(scores, shared, view)
     return next(iter([*tests.changes(), *tests.rest()]), NO_CHANGE)
 
 
@@ -196,20 +199,6 @@ class _ScoreTests:
     scores: PictureScores
     shared: Sequence[str]
     view: FieldOfView
-
-    @classmethod
-    def of(
-        cls,
-        images: Images,
-        build: Build,
-        settings: Settings,
-        shared: Sequence[str],
-        view: FieldOfView,
-        mapper: Mapper,
-    ) -> _ScoreTests:
-        """Score pictures."""
-        names = [*shared, *chain.from_iterable(KINDS.values())]
-        return cls(PictureScores.of(images, build, settings, names, mapper), shared, view)
 
     @property
     def images(self) -> Images:
@@ -414,7 +403,9 @@ def in_uneven_field(
     kept, refused = list[tuple[str, ...]](), set[str]()
     while True:
         best = fitted(pictures, values, names)
-        tests = _ScoreTests.of(best.images, build, best.values, names, view, mapper)
+        every = (*names, *_TERMS)
+        scores = PictureScores.of(best.images, build, best.values, every, mapper)
+        tests = _ScoreTests(scores, names, view)
         change = next((each for each in tests.changes() if each.kind not in refused), NO_CHANGE)
         if not change.matters:
             break

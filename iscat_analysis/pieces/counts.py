@@ -26,7 +26,6 @@ from iscat_analysis.config import (
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import (
     LARGEST,
-    BoolArray,
     array_of,
     choice_in,
     number_in,
@@ -39,7 +38,7 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.optics.model import collected_area_nm2, photons_per_intensity
 from iscat_analysis.options import takes
-from iscat_analysis.records import FREE_PARAMETERS, FloatArray
+from iscat_analysis.records import FREE_PARAMETERS, BoolArray, FloatArray
 from iscat_analysis.units import count
 
 Array = Annotated["ArrayLike | None", "Optional."]
