@@ -171,7 +171,7 @@ def same_state(one: Estimate, other: Estimate) -> bool:
     """Tell whether two microscopes have the same polarisation, and both a mask or none."""
     first, second = one.values, other.values
     masks = first["mask_na"] > 0, second["mask_na"] > 0
-    return first["polarization"] == second["polarization"] and masks[0] == masks[1]
+    return bool(first["polarization"] == second["polarization"] and masks[0] == masks[1])
 
 
 HELD_OUT = 3

@@ -20,8 +20,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from iscat_analysis._kernels import ComplexArray
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis import calibrated
 from iscat_analysis.errors import ConfigError, DataError
@@ -245,7 +245,7 @@ class _Waves:
         both = (up[:, None] * along[None]).reshape(-1, self.qx.size)
         return np.concatenate([both.real, both.imag[:, 1:]], axis=1)
 
-    def times(self, coefficients: FloatArray, factor: ComplexArray) -> FloatArray:
+    def times(self, coefficients: FloatArray, factor: NDArray[Any]) -> FloatArray:
         """Coefficients of the picture whose waves are multiplied by complex factors."""
         n = self.qx.size
         cos, sin = coefficients[:n], np.concatenate([[0.0], coefficients[n:]])
