@@ -16,18 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.special import gammaincinv, logsumexp, ndtr
 
 from iscat_analysis.findings import Finding, Value, existing
-from iscat_analysis.findings.tables import (
-    BRIEF_VISITORS,
-    BROAD_SPECIES,
-    HALF_DETECTED,
-    NO_ERROR_OR_MASS,
-    NO_LADDER,
-    OUTLIERS,
-    SKEWED_PEAK,
-    TOO_FEW_EVENTS,
-    UNDETECTABLE,
-    UNDETERMINED_SHARE,
-)
+from iscat_analysis.findings import tables as of
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.species.choices import Choice, Chosen, Ladder, LadderFit, Searched, peaks
 from iscat_analysis.species.events import Efficiency, Events, possible
@@ -192,7 +181,7 @@ def describe(
     findings: list[Finding] = []
     if branch == "magnitude" and not usable.all():
         left_out = count(int(np.count_nonzero(~usable)), "event")
-        findings.append(NO_ERROR_OR_MASS({"amount": left_out}))
+        findings.append(of.NO_ERROR_OR_MASS({"amount": left_out}))
     events = Events(np.abs(mass[usable]), sigma[usable], efficiency if limit_known else None)
     result = Distribution(
         species=pd.DataFrame(columns=list(SPECIES_COLUMNS)),
@@ -208,7 +197,7 @@ def describe(
     )
     if events.x.size < LEAST_EVENTS:
         few: dict[str, Value] = {"amount": count(events.x.size, "event"), "needed": LEAST_EVENTS}
-        return replace(result, findings=(*findings, TOO_FEW_EVENTS(few)))
+        return replace(result, findings=(*findings, of.TOO_FEW_EVENTS(few)))
 
     choice = choice or Searched()
     found = choice.choose(events)
@@ -226,7 +215,8 @@ def describe(
     findings += [*_skews(best, species), *_remarks(species, doubtful)]
     findings += existing([_brief(species, window_frames)])
     if ladder is not None and ladder.p_value < 0.01:
-        findings.append(NO_LADDER({"monomer_kda": ladder.monomer_kda, "p_value": ladder.p_value}))
+        monomer = {"monomer_kda": ladder.monomer_kda, "p_value": ladder.p_value}
+        findings.append(of.NO_LADDER(monomer))
     return replace(
         result,
         species=species,
@@ -350,7 +340,8 @@ def _ladder(
     scale = np.append(scale_error(values[:1]), 0.0)
     low, high = widened(interval_of(drawn, 2), values, scale)
     columns = np.column_stack([values, _error(drawn, 2), low, high]).ravel().tolist()
-    names = [f"{of}_{end}" for of in ("monomer", "offset") for end in ("kda", "se", "low", "high")]
+    ends = ("kda", "se", "low", "high")
+    names = [f"{part}_{end}" for part in ("monomer", "offset") for end in ends]
     numbers = dict(zip(names, columns, strict=True))
     return LadderFit(steps=found.steps, held=choice.held, p_value=found.p_value, **numbers)
 
@@ -383,7 +374,7 @@ def _skews(best: Mixture, species: pd.DataFrame) -> Iterator[Finding]:
             # share of the mass from which on a mean that differs from it is told
             means = "" if abs(mean / mass - 1) < 0.02 else f", and its mean is {mean:.4g} kDa"
             masses = {"mass_kda": float(mass), "beside_kda": float(beside)}
-            yield SKEWED_PEAK(masses | {"mean": means})
+            yield of.SKEWED_PEAK(masses | {"mean": means})
 
 
 def _remarks(species: pd.DataFrame, doubtful: BoolArray) -> Iterator[Finding]:
@@ -397,11 +388,11 @@ def _remarks(species: pd.DataFrame, doubtful: BoolArray) -> Iterator[Finding]:
         "factor": MOST_DOUBT, "percent": 100 * LEAST_EFFICIENCY, "needed": LEAST_SPECIES,
     }  # fmt: skip
     for which, kind in (
-        (doubted, UNDETERMINED_SHARE),
-        (undetectable, UNDETECTABLE),
-        (half, HALF_DETECTED),
-        (species["outlier"], OUTLIERS),
-        (broad, BROAD_SPECIES),
+        (doubted, of.UNDETERMINED_SHARE),
+        (undetectable, of.UNDETECTABLE),
+        (half, of.HALF_DETECTED),
+        (species["outlier"], of.OUTLIERS),
+        (broad, of.BROAD_SPECIES),
     ):
         if which.any():
             masses = ", ".join(f"{mass:.3g}" for mass in species["mass_kda"][which])
@@ -417,7 +408,7 @@ def _brief(species: pd.DataFrame, window_frames: int | None) -> Finding | None:
         f"{row.mass_kda:.3g} kDa from {count(round(row.stay_frames), 'frame')}"
         for row in known.itertuples()
     )
-    return BRIEF_VISITORS({"frames": count(window_frames, "frame"), "residence": residence})
+    return of.BRIEF_VISITORS({"frames": count(window_frames, "frame"), "residence": residence})
 
 
 CURVE_COLUMNS = ("mass_kda", "density", "density_se", "model", "model_corrected", "efficiency")

@@ -30,14 +30,7 @@ from scipy.special import log_ndtr
 from iscat_analysis.calibration.line import mass_line, weighed
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.findings import Finding
-from iscat_analysis.findings.tables import (
-    AS_READ,
-    MASSES_REPLACED,
-    NO_ERRORS,
-    NO_MASS,
-    REJECTED_BY_HAND,
-    UNKNOWN_LIMIT,
-)
+from iscat_analysis.findings import tables as of
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie.tables import named, read_events, unit_note
 from iscat_analysis.options import EventOptions, only, takes
@@ -111,7 +104,7 @@ class EventTable:
         if self.edge_kda is None:
             return self.findings
         below = {"amount": f"below {self.edge_kda:.3g} kDa"}
-        return *self.findings, UNKNOWN_LIMIT(below, where=self.name)
+        return *self.findings, of.UNKNOWN_LIMIT(below, where=self.name)
 
 
 def mass_in(name: str, value: float, what: str = "mass in kDa") -> float:
@@ -170,17 +163,17 @@ def event_table(
         called = name or str(events)
         table = read_events(Path(events))
     file = table.attrs.get("file")
-    findings = [AS_READ({"text": note}) for note in table.attrs["notes"]]
+    findings = [of.AS_READ({"text": note}) for note in table.attrs["notes"]]
     if line is not None:
         table, times = weighed(table, mass_line(line), called)
-        findings += [] if times is None else [MASSES_REPLACED({"times": times})]
+        findings += [] if times is None else [of.MASSES_REPLACED({"times": times})]
     elif table["mass_kda"].isna().all() and table["contrast"].notna().any():
         raise DataError(
             f"{called}: has contrasts and no masses; give `calibration`, a mass line as iscat "
             "calibrate mass writes it"
         )
     if "status" not in table and (doubt := unit_note(table["mass_kda"].to_numpy(float))):
-        findings.append(AS_READ({"text": doubt}))
+        findings.append(of.AS_READ({"text": doubt}))
     table = _checked(table)
     found, efficiency = _usable(table, called, sigma_kda), None
     if above_kda is not None:
@@ -284,12 +277,12 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
     good, findings = table, []
     if "status" in table:
         good, said = species_rows(table)
-        findings += [AS_READ({"text": sentence}) for sentence in said]
+        findings += [of.AS_READ({"text": sentence}) for sentence in said]
         if good.empty:
             raise DataError(f"{name}: holds no event with status ok")
     if _REJECTED in good and (by_hand := int(good[_REJECTED].sum())):
         good = good[~good[_REJECTED]]
-        findings.append(REJECTED_BY_HAND({"amount": count(by_hand, "event")}))
+        findings.append(of.REJECTED_BY_HAND({"amount": count(by_hand, "event")}))
     mass, sigma, frame, x, y = (
         good[column].to_numpy(np.float64) if column in good else np.full(len(good), math.nan)
         for column in ("mass_kda", "sigma_mass_kda", "frame", "x_px", "y_px")
@@ -298,7 +291,7 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
         sigma = np.full(mass.shape, sigma_kda)
     elif not np.isfinite(sigma[np.isfinite(mass)]).any():
         sigma = np.full(mass.shape, UNKNOWN_SIGMA_KDA)
-        findings.append(NO_ERRORS())
+        findings.append(of.NO_ERRORS())
     known = possible(mass, sigma)
     least, most = POSSIBLE_KDA
     if not known.any():
@@ -311,7 +304,7 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
         if good["contrast"][~known].notna().any():
             advice = "; `calibration` gives them the mass of their contrast"
         limits = {"least": least, "most": most}
-        findings.append(NO_MASS({"amount": count(missing, "event"), "advice": advice, **limits}))
+        findings.append(of.NO_MASS({"amount": count(missing, "event"), "advice": advice, **limits}))
     rows = good[known]
     window = rows["n_after"].max() if "n_after" in rows else 0
     window_frames, told = int(np.nan_to_num(window)) or None, tuple(findings)
