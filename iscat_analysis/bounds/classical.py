@@ -11,11 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iscat_analysis._kernels import ComplexArray
 from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood, ModelLikelihood
-from iscat_analysis.records import PARAMETERS, FloatArray
+from iscat_analysis.records import PARAMETERS, ComplexArray, FloatArray
 
 LEAST_COMPONENT = 1e-3
 """Component of an unidentifiable direction below which a parameter is not part of it."""

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis._kernels import ComplexArray
 from iscat_analysis.bounds.classical import EventBounds, bounds_from_matrices, event_bounds
 from iscat_analysis.bounds.holevo import natural_bound
 from iscat_analysis.bounds.quantum import (
@@ -29,7 +28,7 @@ from iscat_analysis.inference.models import TurningRod
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
 from iscat_analysis.optics.model import collected_area_nm2, photons_per_intensity
 from iscat_analysis.optics.scatterers import ANGLES, Rod
-from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
+from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, ComplexArray, FloatArray
 
 
 @dataclass(frozen=True)

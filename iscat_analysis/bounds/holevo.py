@@ -34,11 +34,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from iscat_analysis._kernels import ComplexArray
 from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.forward import ForwardModel
-from iscat_analysis.records import PARAMETERS, FloatArray
+from iscat_analysis.records import PARAMETERS, ComplexArray, FloatArray
 
 
 @dataclass(frozen=True)

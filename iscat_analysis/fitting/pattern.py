@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera import Mover, Trajectory, filling, follow_pattern, still_light, trusted
 from iscat_analysis.fitting.events import Region
-from iscat_analysis.records import ComplexArray, FloatArray, Mapper
+from iscat_analysis.records import ComplexArray, FloatArray, IntArray, Mapper
 from iscat_analysis.search.frames import Chunk
 from iscat_analysis.search.sliding import STRIDES
 
@@ -295,7 +295,7 @@ class MovingPattern:
         return out
 
 
-def _blocks(edges: NDArray[np.int64]) -> list[slice]:
+def _blocks(edges: IntArray) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in pairwise(edges)]
 
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis._kernels import ComplexArray
 from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.camera import Trajectory
 from iscat_analysis.fitting.context import AnalysisContext
@@ -23,6 +22,7 @@ from iscat_analysis.records import (
     FREE_PARAMETERS,
     NO_MODEL,
     Clip,
+    ComplexArray,
     EventView,
     FloatArray,
     PosteriorResult,

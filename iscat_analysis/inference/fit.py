@@ -431,10 +431,7 @@ def _at_bound(
 
 
 def goodness_of_fit(
-    likelihood: Likelihood,
-    theta: FloatArray,
-    free: BoolArray,
-    derivatives: FloatArray | None = None,
+    likelihood: Likelihood, theta: FloatArray, free: BoolArray, rows: FloatArray | None = None
 ) -> tuple[float, float]:
     """Judge one fit.
 
@@ -442,19 +439,16 @@ def goodness_of_fit(
     -----
     Z. Šidák, J. Am. Stat. Assoc. 62, 626 (1967).
 
-    Shapes: `theta` (5,), `free` (5,), `derivatives` (ny, ROWS, nx).
+    Shapes: `theta` (5,), `free` (5,), `rows` (ny, ROWS, nx).
     """
-    chi2, p_values = three_tests(likelihood, theta, free, derivatives)
+    chi2, p_values = three_tests(likelihood, theta, free, rows)
     if math.isnan(p_values[0]):
         return chi2, math.nan
     return chi2, -math.expm1(len(p_values) * math.log1p(-min(*p_values, 1 - 1e-16)))
 
 
 def three_tests(
-    likelihood: Likelihood,
-    theta: FloatArray,
-    free: BoolArray,
-    derivatives: FloatArray | None = None,
+    likelihood: Likelihood, theta: FloatArray, free: BoolArray, rows: FloatArray | None = None
 ) -> tuple[float, tuple[float, float, float]]:
     """Test one fit for the scatter of its residuals, for structure in them, and for outliers.
 
@@ -465,9 +459,9 @@ def three_tests(
     independent of the fitted directions, is compared with its information (C. R. Rao, Proc. Camb.
     Phil. Soc. 44, 50, 1948).
 
-    Shapes: `theta` (5,), `free` (5,), `derivatives` (ny, ROWS, nx).
+    Shapes: `theta` (5,), `free` (5,), `rows` (ny, ROWS, nx).
     """
-    rows = likelihood.derivatives(theta) if derivatives is None else derivatives
+    rows = likelihood.derivatives(theta) if rows is None else rows
     free = np.asarray(free, dtype=np.bool_)
     optics, grid = likelihood.model.optics, likelihood.grid
     settings = WAIST * optics.wavelength_nm / optics.na, ORDER, MANY_COUNTS

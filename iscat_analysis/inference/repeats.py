@@ -37,7 +37,7 @@ from scipy.special import ndtri, stdtr, stdtrit
 from iscat_analysis._kernels.sliding import frame_scores
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.maximiser import covariance_of
-from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.records import BoolArray, FloatArray, IntArray
 
 PARTS = 8
 """Contiguous parts of the frames on either side of a step, between which ``repeat_*`` is taken."""
@@ -73,11 +73,7 @@ class Series:
 
 
 def response_of(
-    likelihood: Likelihood,
-    theta: FloatArray,
-    free: BoolArray,
-    before_e: FloatArray,
-    power_ratio: float,
+    likelihood: Likelihood, theta: FloatArray, free: BoolArray, before_e: FloatArray, ratio: float
 ) -> Response | None:
     """Linearise an estimate in its counts.
 
@@ -93,7 +89,7 @@ def response_of(
     data = np.where(used, likelihood.data, 0.0)
     before, after = likelihood.noise.count_response(data, signal, math.exp(level), before_e)
     if not likelihood.model.rho > 0:  # the signal is no share of the background
-        before = -power_ratio * after
+        before = -ratio * after
     terms = likelihood.noise.terms(data, signal, level)
     index = np.flatnonzero(free)
     slope = np.where(used, np.concatenate([first, terms.by_level[None]])[index], 0.0)
@@ -163,7 +159,7 @@ def repeats_of(windows: tuple[Series, ...], longer: tuple[Series, ...] | None = 
     return np.concatenate([out, *spectra])
 
 
-def _means(series: Series, edges: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+def _means(series: Series, edges: IntArray) -> tuple[FloatArray, FloatArray]:
     """Means of contiguous frames per unit of power, and their variances, shape (n, parts) each."""
     sums = np.add.reduceat(series.values[:, : edges[-1]], edges[:-1], axis=1)
     light = np.add.reduceat(series.power[: edges[-1]], edges[:-1])

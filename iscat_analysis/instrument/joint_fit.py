@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iscat_analysis.inference.likelihood import LEVEL
 from iscat_analysis.instrument.particle_image import (
@@ -29,7 +28,7 @@ from iscat_analysis.instrument.particle_image import (
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.local import BASES
 from iscat_analysis.optics.parameters import MASK_NA, PARAMETERS, Prior, Settings
-from iscat_analysis.records import FloatArray, Mapper
+from iscat_analysis.records import FloatArray, IntArray, Mapper
 
 _OWN_STEPS = np.array([60.0, 60.0, 20.0, np.inf, 0.5])  # nm, kDa; a fringe is some 200 nm high
 _DAMPING = (1e-3, 1e8)  # first, and where the search gives up
@@ -150,12 +149,7 @@ class PictureScores:
 
     @classmethod
     def of(
-        cls,
-        images: Images,
-        build: Build,
-        settings: Settings,
-        names: Sequence[str],
-        mapper: Mapper = map,
+        cls, images: Images, build: Build, settings: Settings, names: Sequence[str], mapper: Mapper
     ) -> PictureScores:
         """Score what parameters and coefficients of the field change about the optics."""
         bases = tuple(dict.fromkeys(b for name in names for b in BASES.get(name, (name,))))
@@ -323,7 +317,7 @@ class _Point:
         return shared, np.clip(own, -_OWN_STEPS, _OWN_STEPS)
 
 
-def excess(scatter: FloatArray, scores: FloatArray, owners: NDArray[np.int64]) -> float:
+def excess(scatter: FloatArray, scores: FloatArray, owners: IntArray) -> float:
     """Say how many times more the scores of owners scatter than expected, over all parameters.
 
     The scores of all add up to nothing, which takes one of them.
@@ -382,12 +376,7 @@ class Neighbours:
 
     @classmethod
     def fitted(
-        cls,
-        others: Images,
-        build: Build,
-        build_wide: Build,
-        settings: Settings,
-        mapper: Mapper = map,
+        cls, others: Images, build: Build, build_wide: Build, settings: Settings, mapper: Mapper
     ) -> Neighbours:
         """Fit them, and once more among each other's rings."""
 

@@ -231,19 +231,15 @@ def _likeliest(seen: Collected, search: OpticsSearch) -> _Begun:
 
 
 def _best_heights(
-    images: Images,
-    shifts_nm: Sequence[float],
-    model: ForwardModel,
-    settings: Settings,
-    mapper: Mapper,
+    images: Images, shifts: Sequence[float], model: ForwardModel, settings: Settings, mapper: Mapper
 ) -> tuple[Images, list[float]]:
-    """Fit every image from several heights; give the best fits, and their reduced χ².
+    """Fit every image from heights with several shifts [nm]; give the best, and their reduced χ².
 
     Half a fringe away a particle of the other sign looks much the same, but none leaves here: a fit
     with the sign that the mass had is preferred.
     """
     found: list[list[tuple[bool, float, ParticleImage]]] = [[] for _ in images]
-    for shift in shifts_nm if images else ():
+    for shift in shifts if images else ():
         moved = [image.raised(shift) for image in images]
         begun = with_masses(moved, lambda _: model, settings)
         # of a fit from one of several heights

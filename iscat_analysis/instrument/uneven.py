@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from iscat_analysis.config import JUMPS, MOVES, Config
@@ -34,7 +33,7 @@ from iscat_analysis.instrument.particle_image import (
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.local import BEND, DRIFT, DRIFT_FRAMES, Spot, centre_of, changes_at
 from iscat_analysis.optics.parameters import FREE, Settings, free_names, is_usual, prior_of
-from iscat_analysis.records import FloatArray, Mapper
+from iscat_analysis.records import FloatArray, IntArray, Mapper
 
 KINDS: Mapping[str, tuple[str, ...]] = {
     "the focus moves": (DRIFT,),
@@ -364,7 +363,7 @@ def jump_frame(view: FieldOfView, images: Images, between: tuple[int, int]) -> i
     return found
 
 
-def _lit(movie: Stack, frames: NDArray[np.int64]) -> tuple[NDArray[np.int64], FloatArray]:
+def _lit(movie: Stack, frames: IntArray) -> tuple[IntArray, FloatArray]:
     """Read frames, and leave out those without light; each over its mean; shape (t, y, x)."""
     light = np.array([movie.read(frame, frame + 1)[0] for frame in frames.tolist()], dtype=float)
     level = light.mean(axis=(1, 2))

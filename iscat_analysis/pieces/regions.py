@@ -11,7 +11,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from iscat_analysis._kernels import ComplexArray
 from iscat_analysis.bounds import event_bounds
 from iscat_analysis.config import CameraConfig, Config, Optics, Particle, refuse_rod
 from iscat_analysis.errors import ConfigError, DataError
@@ -36,6 +35,7 @@ from iscat_analysis.records import (
     PARAMETERS,
     Box,
     Candidate,
+    ComplexArray,
     FitResult,
     FloatArray,
     Status,

@@ -29,13 +29,13 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtr, ndtri
 
 from iscat_analysis._kernels.diffusion import displacement_likelihood, most_likely_diffusion
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import array_of, number_in, real_array
-from iscat_analysis.records import FloatArray
+from iscat_analysis.records import BoolArray, FloatArray, IntArray
 
 LEAST_POSITIONS = 4
 """A shorter track says too little: of its displacements, at least one must have two neighbours."""
@@ -60,10 +60,10 @@ class Displacements:
 
     positions_nm: FloatArray
     variance_nm2: FloatArray
-    frames: NDArray[np.int64]
+    frames: IntArray
     interval_s: float
     exposure_s: float
-    counted: NDArray[np.int64]
+    counted: IntArray
 
     @cached_property
     def gaps_s(self) -> FloatArray:
@@ -76,7 +76,7 @@ class Displacements:
         return np.ascontiguousarray(np.diff(self.positions_nm, axis=1)[:, self.counted])
 
     @cached_property
-    def linked(self) -> NDArray[np.bool_]:
+    def linked(self) -> BoolArray:
         """Whether a displacement begins where the one before ended, shape (m − 1,)."""
         return np.asarray(np.diff(self.counted) == 1)
 

@@ -218,15 +218,10 @@ class _Equilibrium:
     """
 
     def __init__(
-        self,
-        series: Series,
-        totals_nm: FloatArray,
-        model: Model,
-        power: float | None,
-        inactive: bool,
+        self, series: Series, totals: FloatArray, model: Model, power: float | None, inactive: bool
     ) -> None:
-        self.series, self.totals, self.model, self.power = series, totals_nm, model, power
-        middle = np.log(totals_nm[totals_nm > 0])
+        self.series, self.totals, self.model, self.power = series, totals, model, power
+        middle = np.log(totals[totals > 0])
         added = [("ln_kd", middle.min() - _REACH, middle.max() + _REACH, middle.mean(), 1.0)]
         if power is None:
             added.append(("power", -1.0, 1.0, LANDING_POWER, LANDING_POWER_SIGMA))

@@ -25,13 +25,13 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import chdtrc
 
 from iscat_analysis._kernels.harmonic_trap import most_likely_well
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in, shown
-from iscat_analysis.records import FloatArray
+from iscat_analysis.records import FloatArray, IntArray
 from iscat_analysis.species.diffusion import NM2_PER_UM2, Displacements, bands, gather
 
 STRETCH = 40
@@ -322,7 +322,7 @@ class Lags(NamedTuple):
     """All time differences between frames, in frames, and the index of the one of each pair."""
 
     distinct: FloatArray
-    which: NDArray[np.int64]
+    which: IntArray
 
     @classmethod
     def of(cls, track: Displacements) -> Lags:

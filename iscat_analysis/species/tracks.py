@@ -77,6 +77,7 @@ from iscat_analysis.records import (
     TRACKS,
     BoolArray,
     FloatArray,
+    IntArray,
     Progress,
     Status,
     TrackStatus,
@@ -116,7 +117,7 @@ class TrackRows:
     crb_mass_kda: FloatArray
     status: NDArray[np.object_]
 
-    def only(self, kept: BoolArray | NDArray[np.int64]) -> TrackRows:
+    def only(self, kept: BoolArray | IntArray) -> TrackRows:
         """Select some of the rows."""
         return TrackRows(*(getattr(self, column.name)[kept] for column in fields(self)))
 
@@ -155,7 +156,7 @@ class TrackRows:
             useful &= self.status != status
         return self.only(useful)
 
-    def timed(self, ticks: NDArray[np.int64] | None) -> TrackRows:
+    def timed(self, ticks: IntArray | None) -> TrackRows:
         """Replace frame numbers by the count of camera intervals, where frames are missing.
 
         Shapes: `ticks` (t,).
@@ -452,7 +453,7 @@ class TrackSetup:
     n_medium: float = 1.33
     change: float = 0.0
     hidden_nm: float = 0.0
-    ticks: NDArray[np.int64] | None = None
+    ticks: IntArray | None = None
     """Intervals of the camera from the movie's first frame to each, where frames are missing."""
 
 

@@ -22,14 +22,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import scipy
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.optics import FLUCTUATING_CONTRAST, SLOW_LANDINGS
 from iscat_analysis.inference.nuisances import Evidence
 from iscat_analysis.inference.repeats import MODES, EmpiricalSpread, spectra_of
-from iscat_analysis.records import FREE_PARAMETERS, BoolArray, FloatArray, Status, has_only
+from iscat_analysis.records import BoolArray, FloatArray, IntArray, Status, has_only
 
 SAME_NM = 150.0
 """Distance within which two steps are at one place."""
@@ -93,7 +92,7 @@ class _Steps:
     Shapes: `row, mass, error, frame, window` (n,), `place` (n, 2).
     """
 
-    row: NDArray[np.int64]
+    row: IntArray
     place: FloatArray
     mass: FloatArray
     error: FloatArray
@@ -241,8 +240,7 @@ class Fluctuation:
         if not good.any():
             return None
         spectra = spectra_of(np.stack(repeats)[good])
-        squares = spectra[..., FREE_PARAMETERS[mode].index("mass_kda")]
-        counts = spectra[..., -1]
+        squares, counts = spectra[..., -2], spectra[..., -1]  # the mass is the last parameter
         frames = (counts.sum(axis=2) + 1).astype(np.int64)  # without, with a particle
         frames[:, 1] = np.maximum(frames[:, 1], there[good])  # of which not all are in bins
         # correlation time over the frames that show it; slower is a course
@@ -291,21 +289,17 @@ InBins = Callable[[int, int], FloatArray]
 
 
 def _noise(
-    pooled: EmpiricalSpread,
-    window: float,
-    squares: FloatArray,
-    counts: FloatArray,
-    frames: NDArray[np.int64],
+    pooled: EmpiricalSpread, width: float, squares: FloatArray, counts: FloatArray, frames: IntArray
 ) -> InBins:
     """Measure the mean square of the components where there is no particle.
 
-    Up to half a window it is that between blocks of frames at empty places.  Slower noise is that
-    of the events' own places before they land or after they leave.
+    Up to half a window, of `width` frames, it is that between blocks of frames at empty places.
+    Slower noise is that of the events' own places before they land or after they leave.
 
     Shapes: `squares, counts` (events, bins), `frames` (events,).
     """
     levels = np.square(pooled.empty[1:-1] or pooled.empty[:1])
-    measured = np.ldexp(window / 8, np.arange(levels.size))
+    measured = np.ldexp(width / 8, np.arange(levels.size))
 
     def in_bins(frames: int, bins: int, slow: float = 1.0) -> FloatArray:
         lengths = frames / (2 * _modes(frames, bins))
@@ -317,7 +311,7 @@ def _noise(
     for square, count, n in zip(squares, counts, frames.tolist(), strict=True):
         bins = int((count > 0).sum())
         if bins:
-            slow = n / (2 * np.array(MODES[:bins])) > window / 2
+            slow = n / (2 * np.array(MODES[:bins])) > width / 2
             excess += float(np.sum((square[:bins] / in_bins(n, bins))[slow]))
             number += float(count[:bins][slow].sum())
     return partial(in_bins, slow=excess / number)
@@ -326,7 +320,7 @@ def _noise(
 def _log_ratio(
     squares: FloatArray,
     counts: FloatArray,
-    frames: NDArray[np.int64],
+    frames: IntArray,
     strength: FloatArray,
     taus: FloatArray,
     noise: InBins,
@@ -356,7 +350,7 @@ def _log_ratio(
     return total
 
 
-def _modes(frames: int, bins: int) -> NDArray[np.int64]:
+def _modes(frames: int, bins: int) -> IntArray:
     """Give the numbers of the components of so many frames that are in bins."""
     return np.arange(1, min(frames, MODES[bins]))
 
@@ -371,7 +365,7 @@ def _binned(values: FloatArray, bins: int) -> FloatArray:
     return np.asarray(np.add.reduceat(values, starts, axis=-1) / sizes)
 
 
-def _components(modes: NDArray[np.int64], frames: int, tau: float) -> FloatArray:
+def _components(modes: IntArray, frames: int, tau: float) -> FloatArray:
     """Variance of cosine components of a process of unit variance and correlation exp(−t/τ).
 
     Two such cosines that are k frames apart have the product ((n − k) cos kθ − sin kθ / sin θ) / n,

@@ -21,7 +21,7 @@ from iscat_analysis.inference.models import SphereOfIndex
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model, peak_per_amplitude
 from iscat_analysis.optics.parameters import prior_of
 from iscat_analysis.optics.sized import SizedModel
-from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
+from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, BoolArray, FloatArray
 
 COMMON = (*PARAMETERS, "contrast")
 """What such errors are told of; of the contrast where it is the result, without a calibration."""
@@ -219,7 +219,7 @@ def response_of(
     )
 
 
-def has_own_index(table: pd.DataFrame) -> NDArray[np.bool_]:
+def has_own_index(table: pd.DataFrame) -> BoolArray:
     """Tell of which rows the index of the sphere was fitted."""
     if "refractive_index" not in table:
         return np.zeros(len(table), dtype=np.bool_)
@@ -275,7 +275,7 @@ def _settings_of(optics: Optics, names: Sequence[str]) -> FloatArray:
     )
 
 
-def amplitude_nodes(amplitude: FloatArray, good: NDArray[np.bool_]) -> FloatArray:
+def amplitude_nodes(amplitude: FloatArray, good: BoolArray) -> FloatArray:
     """Amplitudes for which the response is computed; they span those of the good fits."""
     spanned = amplitude[good] if good.any() else amplitude
     low, high = float(spanned.min()), float(spanned.max())

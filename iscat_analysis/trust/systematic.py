@@ -18,7 +18,6 @@ from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from iscat_analysis.bounds import peak_gradient
@@ -38,7 +37,7 @@ from iscat_analysis.optics.forward import (
 from iscat_analysis.optics.local import BASES, REFERENCE, WEIGHTS, centre_of, when
 from iscat_analysis.optics.scatterers import material
 from iscat_analysis.optics.waves import Template
-from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
+from iscat_analysis.records import FREE_PARAMETERS, BoolArray, FloatArray, Status
 from iscat_analysis.trust.response import (
     COMMON,
     Response,
@@ -311,7 +310,7 @@ def _of_heavy_particles(scale: MassScale, config: Config, table: pd.DataFrame) -
     return {"mass_kda": off} if np.nansum((off / sigma) ** 2) > _LEAST_SIGMAS**2 else {}
 
 
-def is_bent(scale: MassScale, table: pd.DataFrame) -> NDArray[np.bool_]:
+def is_bent(scale: MassScale, table: pd.DataFrame) -> BoolArray:
     """Tell which masses a line of faint standards is clearly wrong about.
 
     Shapes: result (rows,).
