@@ -17,7 +17,7 @@ from iscat_analysis.errors import DataError
 
 GAIN, OFFSET, READ_E = 4.0, 100.0, 20.0
 READ_WITH_ROUNDING_E = math.hypot(READ_E, GAIN / math.sqrt(12))
-SEEDS = 12
+SEEDS = 8
 SHAPE = (48, 48)
 
 

@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 import tifffile
 from event_tables import draw_series
-from small_movies import SETUP, simulate
+from small_movies import SETUP, put_in_place_of_fits, simulate
 
 import iscat_analysis as ia
 from iscat_analysis.day import Batch, jobs
@@ -52,6 +52,7 @@ def done(made: Path, tmp_path_factory) -> Path:
     folder = shutil.copytree(made, tmp_path_factory.mktemp("done") / "lab")
     _table(folder, NAMES)
     assert _run(folder).analysed == NAMES
+    shutil.copytree(folder / "out" / "movies" / "a.iscat", folder.parent / "movie.iscat")
     return folder
 
 
@@ -59,6 +60,12 @@ def done(made: Path, tmp_path_factory) -> Path:
 def finished(done: Path, tmp_path: Path) -> Path:
     """Return a copy of a folder whose samples are analysed."""
     return shutil.copytree(done, tmp_path / "lab")
+
+
+@pytest.fixture
+def quick(done: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every fit take a finished result."""
+    put_in_place_of_fits(done.parent, monkeypatch)
 
 
 @pytest.fixture
@@ -136,6 +143,7 @@ def test_a_batch_is_printed_as_one_object(done: Path, capsys, tmp_path: Path) ->
         jsonschema.Draft202012Validator(schema("batch")).validate({**printed, "failed": ["a"]})
 
 
+@pytest.mark.usefixtures("quick")
 def test_only_what_has_changed_is_analysed_again(finished: Path) -> None:
     _run(finished)  # the page tells where the table lies
     page = finished / "out" / "batch.html"
@@ -171,6 +179,7 @@ def test_a_changed_configuration_analyses_all_and_a_changed_row_its_movie(finish
     assert config.fit.roi_nm == 1900.0
 
 
+@pytest.mark.usefixtures("quick")
 def test_a_movie_that_fails_costs_only_itself(lab: Path, capsys, tmp_path: Path) -> None:
     _table(lab, ("a", "cut", "b"))
     setup = tmp_path / "setup.toml"
@@ -202,11 +211,13 @@ def _failing(error: BaseException, name: str) -> Callable[..., object]:
     return fit
 
 
+@pytest.mark.usefixtures("quick")
 def test_an_unexpected_error_costs_only_its_movie(lab: Path, monkeypatch) -> None:
     monkeypatch.setattr(jobs, "fit_stack", _failing(ZeroDivisionError("by chance"), "b.tif"))
     assert _run(lab).failed == (("b", "unexpected ZeroDivisionError: by chance"),)
 
 
+@pytest.mark.usefixtures("quick")
 def test_an_interrupt_keeps_what_is_finished(lab: Path, monkeypatch) -> None:
     """One that reached compiled code is hidden in an error of its own."""
     hidden = SystemError("returned a result with an exception set")

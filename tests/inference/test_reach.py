@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -14,7 +15,6 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.records import FitResult
 from iscat_analysis.study import Setting, run_trials, trial_generator
 
-TRIALS = 400
 STANDARD_ERRORS = 4.0
 FAR = 5.0
 
@@ -30,10 +30,12 @@ def _trial(experiment: Setting, number: int) -> tuple[Likelihood, FitResult]:
 
 
 @pytest.mark.parametrize(("mode", "photons"), [("mass", 100.0), ("mass", 300.0), ("joint", 300.0)])
-def test_places_of_few_photons_are_as_uncertain_as_stated(mode: str, photons: float) -> None:
+def test_places_of_few_photons_are_as_uncertain_as_stated(
+    mode: str, photons: float, repetitions: Callable[[int, int], int]
+) -> None:
     """By the curvature the spread along y is 1.25 to 1.5 errors, and one fit 6 of them off."""
     experiment = setting("darkfield", mode, photons=photons, z_nm=200.0)
-    found = run_trials(experiment, TRIALS, seed=2021, stream=11)
+    found = run_trials(experiment, repetitions(160, 400), seed=2021, stream=11)
     pulls = ((found.estimate - found.truth) / found.sigma)[found.unflagged]
     for k in range(2):
         spread = float(np.sqrt(np.mean(pulls[:, k] ** 2)))

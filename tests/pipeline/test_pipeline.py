@@ -69,12 +69,13 @@ def _run(config: Config, folder: Path, **options: Any) -> tuple[Analysis, pd.Dat
 def _run_with(folder: Path, *places: tuple[Any, int, int], count: int) -> tuple[Analysis, Any]:
     """Analyse a movie some of whose counts are replaced."""
     movie = folder / "movie.tif"
-    truth = write_stack(_small(), movie)
+    config = _small(**AS_CONFIGURED)
+    truth = write_stack(config, movie)
     counts = tifffile.imread(movie)
     for place in places:
         counts[place] = count
     tifffile.imwrite(movie, counts, photometric="minisblack")
-    return fit_stack(movie, _small()), truth
+    return fit_stack(movie, config), truth
 
 
 def _match(table: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
@@ -190,7 +191,7 @@ def test_the_summary_counts_and_names(sampled) -> None:
 
 
 def test_workers_do_not_change_results(tmp_path: Path) -> None:
-    config = _small(posterior={"enabled": True, "walkers": 10, "steps": 200})
+    config = _small(**AS_CONFIGURED, posterior={"enabled": True, "walkers": 10, "steps": 200})
     path = tmp_path / "movie.tif"
     write_stack(config, path)
     runs = []
@@ -327,7 +328,7 @@ def test_maps_of_gain_and_offset(tmp_path: Path) -> None:
     for key, values in maps.items():
         camera[key] = str(tmp_path / f"{key}.tif")
         tifffile.imwrite(camera[key], values.astype("f4"), photometric="minisblack")
-    analysis, truth = _run(_small(camera=camera), tmp_path)
+    analysis, truth = _run(_small(**AS_CONFIGURED, camera=camera), tmp_path)
     _assert_true(analysis.table, truth, "mass")
 
 
@@ -339,7 +340,7 @@ def test_a_dead_pixel_beside_a_particle_does_no_harm(tmp_path: Path) -> None:
 
 
 def test_the_pixel_size_comes_from_the_movie(tmp_path: Path) -> None:
-    config = _small()
+    config = _small(**AS_CONFIGURED)
     movie = tmp_path / "movie.tif"
     truth = write_stack(config, movie)
     silent = config.camera.model_copy(update={"pixel_size_nm": None})
@@ -348,7 +349,7 @@ def test_the_pixel_size_comes_from_the_movie(tmp_path: Path) -> None:
     _assert_true(analysis.table, truth, "mass")
     other = config.camera.model_copy(update={"pixel_size_nm": 90.0})
     disagreeing = fit_stack(
-        movie, _small(**AS_CONFIGURED).model_copy(update={"camera": other}), out=tmp_path / "other"
+        movie, config.model_copy(update={"camera": other}), out=tmp_path / "other"
     )
     assert any("84.4" in text and "90" in text for text in disagreeing.warnings)
 
@@ -358,7 +359,7 @@ def test_the_pixel_size_comes_from_the_movie(tmp_path: Path) -> None:
 
 def test_right_and_down_are_larger(tmp_path: Path) -> None:
     """The counts themselves say where the particles are: no simulator decides this."""
-    config = _small(simulation={"power_noise": 0.0})
+    config = _small(**AS_CONFIGURED, simulation={"power_noise": 0.0})
     movie = tmp_path / "movie.tif"
     write_stack(config, movie)
     counts = tifffile.imread(movie).astype(float)
@@ -375,7 +376,7 @@ def test_right_and_down_are_larger(tmp_path: Path) -> None:
 
 def test_a_particle_that_leaves_has_negative_mass(tmp_path: Path) -> None:
     events = [{"frame": 0, "leave": 30, "x_px": 30.0, "y_px": 40.0, "mass_kda": 1500.0}]
-    analysis, truth = _run(_small(simulation={"events": events}), tmp_path)
+    analysis, truth = _run(_small(**AS_CONFIGURED, simulation={"events": events}), tmp_path)
     (row,) = analysis.table.to_dict("records")
     assert row["status"] == "ok"
     assert row["mass_kda"] == pytest.approx(-truth["mass_kda"][0], abs=FAR * row["sigma_mass_kda"])
@@ -451,5 +452,5 @@ def test_noise_and_drift_of_the_background(moves: bool, tmp_path: Path) -> None:
 
 
 def test_no_drift_where_there_is_no_pattern(tmp_path: Path) -> None:
-    found, _ = _run(_small(simulation={"background": "flat"}), tmp_path)
+    found, _ = _run(_small(**AS_CONFIGURED, simulation={"background": "flat"}), tmp_path)
     assert found.summary["background"]["drift_px"] is None
