@@ -243,20 +243,16 @@ class Neighbours:
         if self.pattern is None:
             factor: FloatArray = (1 + shares[1] * image) / (1 + shares[0] * image)
             return factor
-        windows = before, after
-        blocks = self._presences(step)
-        held = [float(self.pattern.weights(before, after, window) @ blocks) for window in windows]
-        if shares == tuple(held):
+        blocks, windows = self._presences(step), (before, after)
+        held = tuple(float(self.pattern.weights(before, after, w) @ blocks) for w in windows)
+        if shares == held:
             return np.ones(image.shape)
-        there = [
-            1 + share * self.seen(step, self._present(step, window), inside)
-            for share, window in zip(shares, windows, strict=True)
+        light = [
+            (1 + share * self.seen(step, self._present(step, window), inside))
+            / (1 + known * self.seen(step, window, inside))
+            for window, share, known in zip(windows, shares, held, strict=True)
         ]
-        known = [
-            1 + share * self.seen(step, window, inside)
-            for share, window in zip(held, windows, strict=True)
-        ]
-        moving: FloatArray = there[1] / there[0] * known[0] / known[1]
+        moving: FloatArray = light[1] / light[0]
         return moving
 
     def apply(
@@ -266,16 +262,9 @@ class Neighbours:
         if self.pattern is None and not self.overlaps(step, before.start, after.stop):
             return  # there in all of these frames, or in none
         shared = self.shared(step, region)
-        if shared is None:
-            return
-        here, inside = shared
-        if self.pattern is not None:
+        if shared is not None:
+            here, inside = shared
             ratio[here] *= self.factor(step, before, after, inside)
-            return
-        shares = self.presence(step, before), self.presence(step, after)
-        if shares[0] != shares[1]:
-            image = step.image[inside].astype(np.float64)
-            ratio[here] *= (1.0 + shares[1] * image) / (1.0 + shares[0] * image)
 
     def interfere(
         self,
@@ -359,8 +348,7 @@ class Neighbours:
     def add_change(self, total: FloatArray, step: Step, before: slice, after: slice) -> None:
         """Add to a field the contrast that a step's particle makes between ranges of frames."""
         image, share = self.change(step, before, after)
-        (top, left), (rows, columns) = step.corner, image.shape
-        total[top : top + rows, left : left + columns] += share * image
+        total[self.box(step)] += share * image
 
     def _present(self, step: Step, frames: slice) -> slice:
         """Select the frames in which the particle is there; all frames if it is in none."""
@@ -390,12 +378,7 @@ class Neighbours:
 
         Others are near in time within the windows, or within `frames` if these are more.
         """
-        x, y, frame = (
-            np.array(values, dtype=float)
-            for values in zip(
-                *((s.start.x_px, s.start.y_px, s.at.frame) for s in steps), strict=True
-            )
-        )
+        x, y, frame = np.array([(s.start.x_px, s.start.y_px, s.at.frame) for s in steps]).T
         reach = np.array([self.reach_px(s) for s in steps])
         windows = SPAN if self.pattern is None else self.pattern.windows
         seen, bound = [], []

@@ -9,10 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iscat_analysis.fitting.events import Event, Region, Told, region_around
 from iscat_analysis.fitting.pattern import LocalPattern
@@ -366,43 +364,32 @@ def clip_of(fitted: StepEvent, patch: Patch, neighbours: Neighbours) -> Clip | N
         slice(top - whole.rows[0], bottom - whole.rows[0]),
         slice(left - whole.columns[0], right - whole.columns[0]),
     )
-    # windows begin and end where others do, so that the parts between are summed once
     ends = [turn + k * window // CLIP_STEPS for k in range(-2 * CLIP_STEPS, 2 * CLIP_STEPS + 1)]
-    (before_e, after_e), (n_before, n_after), (power_before, power_after) = map(
-        _on_both_sides, patch.windows(ends)
-    )
+    sums = [patch.window(*span) for span in zip(ends, ends[CLIP_STEPS:], strict=False)]
+    pairs = list(zip(sums, sums[CLIP_STEPS:], strict=False))  # of windows before and after
+    counted = np.array([min(one[1], other[1]) for one, other in pairs])
     # near the ends of a movie, the frames of the fit
-    least = min(window / 2, n_before[CLIP_STEPS], n_after[CLIP_STEPS])
-    held = np.flatnonzero(np.minimum(n_before, n_after) >= max(least, 1))
+    held = np.flatnonzero(counted >= max(min(window / 2, counted[CLIP_STEPS]), 1)).tolist()
     if len(held) < 2:
         return None
-    ratio = power_after[held] / power_before[held]
-    expected_e = before_e[held] * ratio[:, None, None]
-    if local is not None:
-        for expected, k in zip(expected_e, held, strict=True):
-            first, middle, last = (ends[k + side * CLIP_STEPS] for side in (0, 1, 2))
-            spans = (first, middle), (middle, last)
-            seen = [local.seen(chunk.cut(*span)) for span in spans]
-            expected *= seen[1] / seen[0]
-    images = _ratio(after_e[held], expected_e, patch.usable, fold)
+    images = []
+    for k in held:
+        (before_e, _, before), (after_e, _, after) = pairs[k]
+        expected_e = before_e * (after / before)
+        if local is not None:
+            first, middle, last = ends[k : k + 2 * CLIP_STEPS + 1 : CLIP_STEPS]
+            seen = [local.seen(chunk.cut(*span)) for span in ((first, middle), (middle, last))]
+            expected_e *= seen[1] / seen[0]
+        images.append(_ratio(after_e, expected_e, patch.usable, fold))
     frames = tuple(ends[CLIP_STEPS + k] for k in held)
-    return Clip(frames, window, images.astype(np.float32))
-
-
-def _on_both_sides(parts: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Sum the `CLIP_STEPS` parts before each end, and those after it, where there are as many."""
-    summed = np.cumsum(np.concatenate([0 * parts[:1], parts]), axis=0)
-    middle = summed[CLIP_STEPS:-CLIP_STEPS]
-    return middle - summed[: -2 * CLIP_STEPS], summed[2 * CLIP_STEPS :] - middle
+    return Clip(frames, window, np.array(images, dtype=np.float32))
 
 
 def _ratio(after: FloatArray, expected: FloatArray, used: BoolArray, fold: int) -> FloatArray:
     """Give counts over those expected, less 1, of squares of pixels; NaN where none is used."""
-    number, rows, columns = after.shape
-    squares = (number, rows // fold, fold, columns // fold, fold)
-    sums = [
-        np.where(used, part, 0.0).reshape(squares).sum(axis=(2, 4)) for part in (after, expected)
-    ]
+    squares = after.shape[0] // fold, fold, after.shape[1] // fold, fold
+    both = (np.where(used, part, 0.0).reshape(squares) for part in (after, expected))
+    sums = [part.sum(axis=(1, 3)) for part in both]
     ratio = np.full(sums[0].shape, np.nan)
     np.divide(sums[0], sums[1], out=ratio, where=sums[1] > 0)
     return ratio - 1

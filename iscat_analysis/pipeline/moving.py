@@ -116,8 +116,9 @@ class MovingSearch:
         def search(threshold: float) -> pd.DataFrame:
             lowered = with_threshold(context, threshold)
             found = search_frames(lowered, field, ground, rows, (here, here + 1))
-            mass = np.asarray(context.model.scale.mass(found.strength))
-            each = zip(found.x_px, found.y_px, found.snr, found.z_nm, mass, strict=True)
+            (x_nm, y_nm, z_nm, amplitude, _), pixel = found.theta.T, field.pixel_nm
+            mass = np.asarray(context.model.scale.mass(amplitude))
+            each = zip(x_nm / pixel, y_nm / pixel, found.snr, z_nm, mass, strict=True)
             return candidate_table(
                 (x, y, snr, context.model.peak_contrast(float(z), float(m)), m)
                 for x, y, snr, z, m in each

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import find_objects, label
 
 from iscat_analysis._kernels.sliding import block_sums
 from iscat_analysis.camera import Camera, check_counts, sampled
@@ -30,7 +31,6 @@ from iscat_analysis.search.frames import (
     cut_field,
     frames_in_place,
     make_chunk,
-    make_tile_chunk,
     measure_frames,
     row_of_sums,
     sums_of,
@@ -211,7 +211,7 @@ class Reader:
             self._buffer[piece[0] - start : piece[1] - start] = self._movie.read(*piece)
 
         def check(piece: tuple[int, int]) -> None:
-            for run in _runs(lit[piece[0] - begin : piece[1] - begin]):
+            for (run,) in find_objects(label(lit[piece[0] - begin : piece[1] - begin])[0]):
                 low, high = piece[0] + run.start, piece[0] + run.stop
                 frames = self._frames(low, high)
                 check_counts(frames, low, self.name, camera=self.camera)
@@ -270,14 +270,10 @@ class Reader:
         """Frames of one tile, summed in blocks."""
         if not self._placed:
             self._hold(*sums.span, pool.map)
-        return make_tile_chunk(
-            self._stored(*sums.span, tile.here),
-            sums,
-            self.camera.part(tile.here),
-            stride=stride,
-            check=self._check,
-            let_go=self._let_go,
-            mapper=pool.map,
+        counts, camera = self._stored(*sums.span, tile.here), self.camera.part(tile.here)
+        part = sums.span[0], counts, sums.good, sums.power, camera
+        return make_chunk(
+            *part, stride=stride, sums=sums, mapper=pool.map, check=self._check, let_go=self._let_go
         )
 
     def _lit(self, span: tuple[int, int], pool: ThreadPoolExecutor) -> tuple[BoolArray, FloatArray]:
@@ -301,13 +297,6 @@ class Reader:
             check_counts(counts, self.first, self.name, camera=self.camera)
             raise DataError(f"{self.name}: has no two frames that differ; export it again")
         return used
-
-
-def _runs(flags: BoolArray) -> Iterator[slice]:
-    """Yield the ranges in which a mask is true."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    for start, stop in edges.reshape(-1, 2):
-        yield slice(int(start), int(stop))
 
 
 def reader_of(movie: CountSource, config: Config, camera: Camera, span: tuple[int, int]) -> Reader:

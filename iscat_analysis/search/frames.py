@@ -392,29 +392,12 @@ class Patch:
         frames = int(np.count_nonzero(part.good))
         return self.gain * (out - frames * self.offset), frames, float(part.power.sum())
 
-    def windows(self, ends: Sequence[int]) -> tuple[FloatArray, NDArray[np.int64], FloatArray]:
-        """Sum contiguous parts of the frames.
-
-        Shapes: `electrons` (n, ny, nx), `frames` (n,), `power` (n,).
-        """
-        edges = np.clip(np.asarray(ends, dtype=np.int64) - self.first, 0, len(self.good))
-        parts = (slice(*ends) for ends in pairwise(edges.tolist()))
-        sums = [self.counts[p][self.good[p]].sum(axis=0, dtype=np.float64) for p in parts]
-        out = np.reshape(sums, (edges.size - 1, *self.mean_e.shape))
-        known = np.zeros((2, len(self.good) + 1))
-        np.cumsum(self.good, out=known[0, 1:])
-        np.cumsum(self.power, out=known[1, 1:])
-        frames, power = np.diff(known[:, edges])
-        electrons = self.gain * (out - frames[:, None, None] * self.offset)
-        return electrons, frames.astype(np.int64), power
-
     def part(self, rows: slice, columns: slice) -> Patch:
         """Copy some of its pixels, which count from its own first one."""
-        here, frames = (rows, columns), slice(0, len(self.counts))
-        ends = (rows.start, rows.stop), (columns.start, columns.stop)
+        here = rows, columns
         return replace(
             self,
-            counts=_region(StoredFrames([self.counts]), frames, *ends),
+            counts=self.counts[:, rows, columns].copy(),
             gain=_at(self.gain, here),
             offset=_at(self.offset, here),
             read_noise_e=_at(self.read_noise_e, here),
@@ -517,30 +500,6 @@ def row_of_sums(stored: np.dtype[Any], columns: int) -> NDArray[Any]:
     return np.empty(columns, dtype=exact)
 
 
-def make_chunk(
-    first: int,
-    counts: NDArray[Any],
-    good: BoolArray,
-    light_e: FloatArray,
-    camera: Camera,
-    *,
-    stride: int,
-    mapper: Mapper = map,
-    check: Callable[[], None] = lambda: None,
-) -> Chunk:
-    """Sum consecutive frames in blocks.
-
-    Shapes: `counts` (t, y, x), `good` (t,), `light_e` (t,).
-    """
-    stored, span = StoredFrames([counts]), (first, first + len(counts))
-    edges, blocks, highest = _sum_blocks(stored, good, camera, stride, check, mapper, highest=True)
-    electrons = blocks.sum(axis=0, dtype=np.float64)
-    sums = sums_of(span, good, light_e, electrons, highest.max(axis=0), camera)
-    frames: dict[str, Any] = {"counts": stored, "camera": camera, "edges": edges}
-    frames["blocks_e"] = blocks
-    return Chunk(**vars(sums), **frames, check=check, let_go=_nothing, lends_blocks=False)
-
-
 def sums_of(
     span: tuple[int, int],
     good: BoolArray,
@@ -563,71 +522,54 @@ def sums_of(
     return FieldSums(span, good, power, float(mean.mean()), mean, usable, saturated)
 
 
-def make_tile_chunk(
-    counts: StoredFrames,
-    sums: FieldSums,
+def make_chunk(
+    first: int,
+    counts: NDArray[Any] | StoredFrames,
+    good: BoolArray,
+    light_e: FloatArray,
     camera: Camera,
     *,
     stride: int,
-    check: Callable[[], None],
-    let_go: Callable[[], None],
+    sums: FieldSums | None = None,
     mapper: Mapper = map,
+    check: Callable[[], None] = lambda: None,
+    let_go: Callable[[], None] | None = None,
 ) -> Chunk:
-    """Sum the frames of a tile in blocks; light and pixels left out are known from the field.
+    """Sum consecutive frames in blocks; `sums` are those of the field, where they are of a tile.
 
-    Shapes: `counts` (t, y, x).
+    Shapes: `counts` (t, y, x), `good` (t,), `light_e` (t,).
     """
+    stored = counts if isinstance(counts, StoredFrames) else StoredFrames([counts])
+    frames, rows, columns = stored.shape
+    edges = np.append(np.arange(0, frames, stride), frames).astype(np.int64)
+    blocks = np.zeros((edges.size - 1, rows, columns), dtype=np.float32)
+    offset, end = np.asarray(camera.offset_adu), let_go or _nothing
+    highest = np.empty(blocks.shape if sums is None else (len(blocks), 0, 0), dtype=stored.dtype)
 
-    def check_and_let_go() -> None:
+    def one(k: int) -> None:
         check()
-        let_go()
+        block, (top, left) = stored.whole(int(edges[k]), int(edges[k + 1]))
+        lit = good[edges[k] : edges[k + 1]]
+        if sums is None:
+            highest[k] = block[np.argmax(lit), top : top + rows, left : left + columns]
+        row = row_of_sums(stored.dtype, columns)
+        block_sums(block, (top, left), lit, row, blocks[k], highest[k])
+        blocks[k] -= np.count_nonzero(lit) * offset
+        blocks[k] *= camera.gain_e_per_adu
+        end()
 
-    edges, blocks, _ = _sum_blocks(
-        counts, sums.good, camera, stride, check_and_let_go, mapper, highest=False
-    )
-    let_go()
-    frames: dict[str, Any] = {"counts": counts, "camera": camera, "edges": edges}
-    frames["blocks_e"] = blocks
-    return Chunk(**vars(sums), **frames, check=check, let_go=let_go, lends_blocks=True)
+    list(mapper(one, range(edges.size - 1)))
+    if sums is None:
+        electrons = blocks.sum(axis=0, dtype=np.float64)
+        span = first, first + frames
+        sums = sums_of(span, good, light_e, electrons, highest.max(axis=0), camera)
+    of_frames: dict[str, Any] = {"counts": stored, "camera": camera, "edges": edges}
+    of_frames |= {"blocks_e": blocks, "check": check, "let_go": end}
+    return Chunk(**vars(sums), **of_frames, lends_blocks=let_go is not None)
 
 
 def _nothing() -> None:
     """Keep the pages of the frames."""
-
-
-def _sum_blocks(
-    counts: StoredFrames,
-    good: BoolArray,
-    camera: Camera,
-    stride: int,
-    check: Callable[[], None],
-    mapper: Mapper,
-    *,
-    highest: bool,
-) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[Any]]:
-    """Sum blocks of so many frames, and find the highest count of each pixel in each if asked to.
-
-    Shapes: `counts` (t, y, x), `blocks_e` (k, y, x), `most` (k, y, x) or (k, 0, 0).
-    """
-    frames, rows, columns = counts.shape
-    edges = np.append(np.arange(0, frames, stride), frames).astype(np.int64)
-    blocks = np.zeros((edges.size - 1, rows, columns), dtype=np.float32)
-    offset = np.asarray(camera.offset_adu)
-    most = np.empty(blocks.shape if highest else (len(blocks), 0, 0), dtype=counts.dtype)
-
-    def one(k: int) -> None:
-        check()
-        block, corner = counts.whole(int(edges[k]), int(edges[k + 1]))
-        lit = good[edges[k] : edges[k + 1]]
-        if highest:
-            top, left = corner
-            most[k] = block[np.argmax(lit), top : top + rows, left : left + columns]
-        block_sums(block, corner, lit, row_of_sums(counts.dtype, columns), blocks[k], most[k])
-        blocks[k] -= np.count_nonzero(lit) * offset
-        blocks[k] *= camera.gain_e_per_adu
-
-    list(mapper(one, range(edges.size - 1)))
-    return edges, blocks, most
 
 
 def _region(

@@ -32,13 +32,15 @@ _REACH_PX = 6  # of the pixels that the spline goes through
 _FINE = np.linspace(-0.625, 0.625, 11)
 
 
-def maxima(fields: NDArray[Any], least: float, reach: tuple[int, int, int]) -> NDArray[np.int64]:
-    """Find local maxima above a threshold in a stack of fields.
+def maxima(
+    fields: NDArray[Any], least: float, reach: tuple[int, int, int], *, both: bool = False
+) -> NDArray[np.int64]:
+    """Find local maxima above a threshold in a stack of fields; of `both` signs if wanted.
 
     Shapes: `fields` (k, y, x), result (n, 3).
     """
     values = np.ascontiguousarray(fields).ravel()
-    at = np.flatnonzero(values > least)
+    at = np.flatnonzero((values > least) | (both & (values < -least)))
     place = np.stack(np.unravel_index(at, fields.shape))
     apart = [math.prod(fields.shape[axis + 1 :]) for axis in range(fields.ndim)]
     offsets = product(*(range(-n, n + 1) for n in reach))
@@ -47,7 +49,7 @@ def maxima(fields: NDArray[Any], least: float, reach: tuple[int, int, int]) -> N
         for axis in np.flatnonzero(offset):  # at an edge, the outermost pixel
             moved = np.minimum(np.maximum(place[axis] + offset[axis], 0), fields.shape[axis] - 1)
             neighbour = neighbour + apart[axis] * (moved - place[axis])
-        kept = values[at] >= values[neighbour]
+        kept = np.abs(values[at]) >= np.sign(values[at]) * values[neighbour]
         at, place = at[kept], place[:, kept]
     return place.T
 

@@ -14,7 +14,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +24,7 @@ from iscat_analysis._kernels.sliding import contrast_map
 from iscat_analysis.camera import NoiseSpectrum
 from iscat_analysis.records import FloatArray, Mapper
 from iscat_analysis.search.frames import Chunk
-from iscat_analysis.search.peaks import SAMPLED, summits
+from iscat_analysis.search.peaks import SAMPLED, maxima, summits
 
 MapArray = NDArray[np.float32]
 
@@ -211,16 +210,6 @@ class Peak(NamedTuple):
     amplitude: float
 
 
-def _local_extremes(maps: MapArray, threshold: float) -> NDArray[np.int64]:
-    """Find where maps (n, y, x) are farther from 0 than at all neighbours; shape (peaks, 3)."""
-    found = np.argwhere((maps > threshold) | (maps < -threshold))
-    last = np.array(maps.shape) - 1
-    for offset in product((-1, 0, 1), repeat=3):
-        here, there = maps[tuple(found.T)], maps[tuple(np.clip(found + offset, 0, last).T)]
-        found = found[there * np.sign(here) <= np.abs(here)]
-    return found
-
-
 def find_steps(
     chunk: Chunk, matched: Filter, snr: MapArray, effective: FloatArray, threshold: float
 ) -> list[Peak]:
@@ -228,7 +217,7 @@ def find_steps(
 
     Shapes: `snr` (n, y, x).
     """
-    at = _local_extremes(snr, SAMPLED * threshold)
+    at = maxima(snr, SAMPLED * threshold, (1, 1, 1), both=True)
     k, i, j = at.T
     dy, dx, above = summits(snr, at)
     value = snr[k, i, j].astype(np.float64)

@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
-from scipy.ndimage import maximum_filter
 
 from iscat_analysis.camera import NoiseSpectrum
 from iscat_analysis.config import Detection
@@ -26,7 +25,15 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.random_field import LOWEST, Excursions, extent
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, check_table
 from iscat_analysis.records import Candidate, FloatArray
-from iscat_analysis.search.peaks import EXCEEDS, SAMPLED, is_hidden, size_on_ring, summits, vertices
+from iscat_analysis.search.peaks import (
+    EXCEEDS,
+    SAMPLED,
+    is_hidden,
+    maxima,
+    size_on_ring,
+    summits,
+    vertices,
+)
 
 HEIGHTS_PER_FRINGE = 8
 """Templates per interference fringe where z is free: half-way between two the match loses 4 %."""
@@ -224,8 +231,7 @@ def _peaks(
 
     The interpolation is in the signed field, which is smooth; its magnitude has kinks at zero.
     """
-    sampled = (best == maximum_filter(best, size=3)) & (best > SAMPLED * threshold)
-    row, column = np.nonzero(sampled)
+    row, column = maxima(best[None], SAMPLED * threshold, (0, 1, 1))[:, 1:].T
     heights = ranked[:, row, column].T
     layer = heights.argmax(axis=1)
     dy, dx, above = summits(signed, np.stack([layer, row, column], axis=1))

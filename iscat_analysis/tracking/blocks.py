@@ -21,7 +21,6 @@ Where heights are fitted no two frames show the same: each is a picture of its o
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -30,10 +29,9 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis._kernels.canvas import box_of
-from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis import Noise, judge_beside, smear_warning
-from iscat_analysis.findings import KINDS, Finding
+from iscat_analysis.findings import Finding, FindingKind
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.results import Followed
 from iscat_analysis.fitting.run import Checkpoint
@@ -185,37 +183,18 @@ class Block:
     inside: BoolArray
     masses: pd.DataFrame
     views: tuple[EventView, ...]
-    level: FloatArray
-    power: FloatArray
-    total_e: FloatArray
-    used: BoolArray
-    saturated: BoolArray
-    noise: tuple[str, ...] = ()
+    windows: Windows
+    """The background and the sum of all frames, side by side."""
+
+    noise: tuple[Finding, ...] = ()
     noise_differs: bool = False
     aligned: Aligned | None = None
 
     @property
-    def frames(self) -> int:
-        """Frames in the block."""
-        return self.span[1] - self.span[0]
-
-    def windows(self, camera: Camera) -> Windows:
-        """Put the background and the sum of all frames side by side."""
-        read = self.frames * camera.read_variance_e2((self.used.shape[0], self.used.shape[1]))
-        return Windows(
-            before_e=self.level * self.power.sum(),
-            after_e=self.total_e,
-            n_before=self.frames,
-            n_after=self.frames,
-            power_ratio=1.0,
-            read_variance_before_e2=read,
-            read_variance_after_e2=read,
-            masked=~self.used,
-            saturated=self.saturated,
-            frames_before=self.span,
-            frames_after=self.span,
-            power=np.concatenate([self.power, self.power]),
-        )
+    def level_e(self) -> float:
+        """Mean light of a pixel of a frame [e]."""
+        windows = self.windows
+        return float(windows.before_e[~windows.masked].mean()) / windows.n_before
 
 
 def analyse_block(
@@ -254,6 +233,7 @@ def analyse_block(
         smeared = smear_warning(context.config, table, moving.smear_nm)
         if smeared:  # what is left over of pictures, far around them, is not the camera's
             noise = Noise((smeared,))
+    read = frames * recording.camera.read_variance_e2((field.used.shape[0], field.used.shape[1]))
     return Block(
         span=span,
         rows=replace(rows, frame=rows.frame + first),
@@ -262,12 +242,21 @@ def analyse_block(
         inside=inside,
         masses=masses,
         views=tuple(row_view(field, ground, rows, int(row)) for row in best.index),
-        level=ground.level,
-        power=ground.power,
-        total_e=field.total_e,
-        used=field.used,
-        saturated=field.saturated,
-        noise=tuple(map(_text_of, noise.findings)),
+        windows=Windows(
+            before_e=ground.level * ground.power.sum(),
+            after_e=field.total_e,
+            n_before=frames,
+            n_after=frames,
+            power_ratio=1.0,
+            read_variance_before_e2=read,
+            read_variance_after_e2=read,
+            masked=~field.used,
+            saturated=field.saturated,
+            frames_before=span,
+            frames_after=span,
+            power=np.tile(ground.power, 2),
+        ),
+        noise=noise.findings,
         noise_differs=noise.differs,
         aligned=aligned,
     )
@@ -299,21 +288,13 @@ def row_view(
     )
 
 
+_KEPT = Block, Localizations, Aligned, Windows, Finding, FindingKind
+
+
 class BlockStore(Checkpoint):
     """Results of blocks on disk."""
 
-    records = (*Checkpoint.records, Block, Localizations, Aligned)
-
-
-def _text_of(finding: Finding) -> str:
-    """Write a finding as text that `finding_of` reads."""
-    return json.dumps([finding.code, dict(finding.values), finding.where], default=float)
-
-
-def finding_of(text: str) -> Finding:
-    """Read what `_text_of` wrote."""
-    code, values, where = json.loads(text)
-    return KINDS[code](values, where=where)
+    records = (*Checkpoint.records, *_KEPT)
 
 
 _MASS = ["mass_kda", "sigma_mass_kda", "crb_mass_kda", "told"]
@@ -328,7 +309,7 @@ class Joined:
     followed: Followed
 
 
-def join_blocks(config: Config, blocks: Sequence[Block], camera: Camera) -> Joined:
+def join_blocks(config: Config, blocks: Sequence[Block]) -> Joined:
     """Make one result of the blocks of a movie."""
     numbers = join_tracks(config, blocks)
     table = table_of_tracks(
@@ -338,9 +319,12 @@ def join_blocks(config: Config, blocks: Sequence[Block], camera: Camera) -> Join
         config.track.min_frames,
         parted=len(blocks) > 1,
     )
-    parts = tuple(block.windows(camera) for block in blocks)
     masses = combine_masses([b.masses for b in blocks], numbers, table)
-    followed = Followed(_together(blocks, parts), parts if len(parts) > 1 else (), masses)
+    parts = tuple(block.windows for block in blocks)
+    if len(parts) > 1:
+        followed = Followed(_together(blocks), parts, masses)
+    else:
+        followed = Followed(parts[0], (), masses)
     return Joined(table, _views(table, blocks, numbers), followed)
 
 
@@ -425,13 +409,12 @@ def _views(
     return tuple(replace(views[key], event=key[1]) for key in keys if key in views)
 
 
-def _together(blocks: Sequence[Block], parts: Sequence[Windows]) -> Windows:
+def _together(blocks: Sequence[Block]) -> Windows:
     """Sum the backgrounds and the frames of all blocks."""
-    if len(parts) == 1:
-        return parts[0]
-    frames, span = sum(b.frames for b in blocks), (blocks[0].span[0], blocks[-1].span[1])
-    light: FloatArray = np.concatenate([b.power * b.level[b.used].mean() for b in blocks])
-    read = frames / blocks[0].frames * parts[0].read_variance_before_e2
+    parts = [block.windows for block in blocks]
+    frames, span = sum(p.n_before for p in parts), (blocks[0].span[0], blocks[-1].span[1])
+    light = np.concatenate([b.windows.power[: b.windows.n_before] * b.level_e for b in blocks])
+    read = frames / parts[0].n_before * parts[0].read_variance_before_e2
     return Windows(
         before_e=np.sum([p.before_e for p in parts], axis=0),
         after_e=np.sum([p.after_e for p in parts], axis=0),

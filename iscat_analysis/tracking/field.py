@@ -139,15 +139,6 @@ def _profile(pictures: Pictures, orders: int) -> FloatArray:
     return np.empty((width // POWERS, POWERS, orders * channels))
 
 
-def draw_rows(
-    field: Field, near: Pictures, far: Pictures, rows: Rows, span: tuple[int, int], canvas: Canvas
-) -> None:
-    """Update a range of frames of the canvas to the current rows."""
-    room = np.empty(max(field.drawn, field.side) ** 2, near.nodes.dtype)
-    brushes = (Brush(pictures, _profile(pictures, 1), room) for pictures in (near, far))
-    draw_frames(field, *brushes, rows, *span, canvas)
-
-
 def fit_with_search(
     field: Field, near: Pictures, search: Search, place: IntArray, room: Room, rows: Rows
 ) -> tuple[float, int]:
@@ -226,7 +217,8 @@ class MovingField:
         if not along_z:
             self._coarse = Field(pixels, pixel_nm, roi_px // COARSE, roi_px, slack, True)
         self.free = np.array([True, True, along_z, True, False])
-        low, high = z_range_nm or (near.height_nm, near.height_nm)
+        self.fringe_nm = near.fringe_nm
+        self.heights_nm = low, high = z_range_nm or (near.height_nm, near.height_nm)
         largest = 100 * abs(near.scale.amplitude(near.material.mass_kda))
         right, bottom = (columns - 1) * pixel_nm + beyond, (rows - 1) * pixel_nm + beyond
         reach = window_nm(pixel_nm)
@@ -380,8 +372,6 @@ class MovingField:
         Returns the rows, which fits converged, the signal of all rows in every frame, and its sum
         over the frames.
         """
-        near, far = self._pictures_for(coarse=coarse)
-        field = self._coarse if coarse else self._whole
         # a tolerance of 0.02 where the next turn goes on with the fit
         search = self._search if sweeps > 1 else self._search._replace(tolerance=0.02)
         n, frames = len(rows.frame), len(light.counts)
@@ -391,7 +381,7 @@ class MovingField:
 
         def some(first: int) -> NDArray[np.float32]:
             last = min(first + at_once, frames)
-            draw_rows(field, near, far, particles, (first, last), canvas)
+            field, near = self._paint(particles, (first, last), canvas, coarse=coarse)
             room = room_for(field, near, self.free)
             scene = Scene(light, field, near, canvas, slopes, room)
             totals = Totals(background, expected, np.zeros(self.used.shape, dtype=np.float32))
@@ -438,8 +428,7 @@ class MovingField:
             canvas = blank(np.empty_like(self._room[first:last]), within)
             starts = np.searchsorted(within.frame, np.arange(first, last + 1)).astype(np.int64)
             particles = Rows(starts, within.theta, within.group)
-            near, far = self._pictures_for(coarse=True)
-            draw_rows(self._coarse, near, far, particles, (0, last - first), canvas)
+            self._paint(particles, (0, last - first), canvas, coarse=True)
             signal = canvas.total
         left = np.empty_like(signal)
         subtract_expected(self._light(ground), signal, first, left)
@@ -473,7 +462,6 @@ class MovingField:
     def judge(self, ground: BackgroundEstimate, rows: Localizations) -> Judged:
         """Compute the information on every row."""
         n, light = len(rows.frame), self._light(ground)
-        near, far = self._pictures_for(coarse=False)
         particles = Rows(rows.starts(self.frames), rows.theta, rows.group)
         fisher, (turned, ways) = np.zeros((n, 4, 4)), np.full((2, n, 4, 4), np.nan)
         bias, numbers = np.zeros((n, 4)), np.zeros((n, 6))
@@ -482,9 +470,8 @@ class MovingField:
 
         def some(part: int) -> None:
             span = part * BLOCK, min((part + 1) * BLOCK, self.frames)
-            draw_rows(self._whole, near, far, particles, span, canvas)
-            room = room_for(self._whole, near, self.free)
-            scene = Scene(light, self._whole, near, canvas, slopes, room)
+            field, near = self._paint(particles, span, canvas, coarse=False)
+            scene = Scene(light, field, near, canvas, slopes, room_for(field, near, self.free))
             judge_frames(scene, self.free, particles, *span, out)
 
         self.share(some, math.ceil(self.frames / BLOCK))
@@ -535,10 +522,20 @@ class MovingField:
         near[:, 3] &= rows.theta[:, 3] >= search.upper[3]  # no mass is the end of none
         return np.asarray((near & self.free).any(axis=1))
 
-    def _pictures_for(self, *, coarse: bool) -> tuple[Pictures, Pictures]:
-        """Give the pictures to fit and to draw; they are the same where little is drawn."""
-        near, far = self._pictures
-        return near, near if coarse and not self.free[2] else far
+    def _paint(
+        self, rows: Rows, span: tuple[int, int], canvas: Canvas, *, coarse: bool
+    ) -> tuple[Field, Pictures]:
+        """Update a range of frames of the canvas to the current rows.
+
+        Returns the squares and the pictures in which they are fitted.
+        """
+        field, (near, far) = self._coarse if coarse else self._whole, self._pictures
+        if coarse and not self.free[2]:
+            far = near  # where little is drawn
+        room = np.empty(max(field.drawn, field.side) ** 2, near.nodes.dtype)
+        brushes = (Brush(pictures, _profile(pictures, 1), room) for pictures in (near, far))
+        draw_frames(field, *brushes, rows, *span, canvas)
+        return field, near
 
     def _light(self, ground: BackgroundEstimate) -> Light:
         level, read = (np.where(self.used, part, 0.0) for part in (ground.level, self.read_e2))

@@ -65,7 +65,7 @@ from iscat_analysis.search.frames import DARK, well_lit
 from iscat_analysis.species.diffusion import gather
 from iscat_analysis.species.tracks import rows_by_track
 from iscat_analysis.threads import start_in_thread, threads
-from iscat_analysis.tracking.blocks import Block, BlockStore, analyse_block, finding_of, join_blocks
+from iscat_analysis.tracking.blocks import Block, BlockStore, analyse_block, join_blocks
 from iscat_analysis.tracking.frames import (
     Plan,
     Recording,
@@ -218,11 +218,11 @@ def _find_in_blocks(
             run.progress("report", 0, 1)  # to gather and keep finished blocks takes a moment
             recording.pool.shutdown(wait=False, cancel_futures=True)
             interrupted = True
-        joined = join_blocks(config, blocks, camera)
+        joined = join_blocks(config, blocks)
         if not interrupted and not fixed_height_warning(config, joined.fits):
             run.report(held_height_warning(ready.config, recording, plan.spans[0], joined.fits))
     windows = joined.followed.windows
-    noise = [] if jitter else [finding_of(text) for text in blocks[0].noise]
+    noise = () if jitter else blocks[0].noise
     run.report(*noise, *pixel_warnings(*windows.left_out))
     if not len(joined.fits) and not interrupted:
         run.report(_nothing_found(context, blocks[0], movie.name))
@@ -308,7 +308,7 @@ def _with_resumption_hint(shelves: Sequence[BlockStore], plan: Plan) -> Iterator
 def _nothing_found(context: AnalysisContext, block: Block, name: str) -> Finding:
     """Compare the signal of a particle with the noise of a frame, where no particle was found."""
     model, grid = context.model, PixelGrid.centred(context.roi_px | 1, context.pixel_nm)
-    light, mass = float(block.level[block.used].mean()), model.material.mass_kda
+    light, mass = block.level_e, model.material.mass_kda
     signal = model.image(grid, 0.0, 0.0, model.height_nm, mass)
     snr = math.sqrt(light * float(np.sum(signal**2)))
     values = {"light_e": light, "mass_kda": mass, "snr": snr}

@@ -29,7 +29,7 @@ import logging
 import math
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -376,12 +376,11 @@ def bridge(config: Config, rows: Localizations) -> IntArray:
     if not may.any():
         return rows.track
     before, after = scipy.optimize.linear_sum_assignment(np.where(may, apart, reach) ** 2)
-    track = rows.track.copy()
-    for i, j in zip(before.tolist(), after.tolist(), strict=True):
-        if may[i, j]:
-            old, new = (int(np.argmax(rows.track == k)) for k in (first.track[j], first.track[i]))
-            track[track == track[old]] = track[new]
-    return track
+    label = first.track.copy()
+    for k in np.argsort(first.frame[after], kind="stable"):  # so that those before are known
+        if may[before[k], after[k]]:
+            label[after[k]] = label[before[k]]
+    return label[np.searchsorted(first.track, rows.track)]
 
 
 def _steps(rows: Localizations) -> tuple[IntArray, FloatArray]:
@@ -430,16 +429,15 @@ _APART_FRAMES = 5  # in which two must be apart before they meet again
 
 def identified(rows: Localizations, *, near_nm: float, error: float) -> Localizations:
     """Exchange what comes after meetings between tracks where that is far more likely."""
-    track, typical = rows.track.copy(), _Typical.of(rows, near_nm, error)
+    track, prior = rows.track.copy(), _Prior(rows, near_nm, error)
     meetings = _meetings(rows, near_nm)
     latest = np.full(len(track), -1)  # meeting of each row
     for k, met in enumerate(meetings):
         latest[met.rows] = k
     for k, met in enumerate(meetings):
-        labels = np.unique(track[met.rows])
-        later = latest > k
-        sides = [_track_side(rows, track, one, met, later, typical) for one in labels[labels >= 0]]
-        for path in _chains(sides, typical):
+        labels, later = np.unique(track[met.rows]), latest > k
+        sides = [_Side(prior, track, one, met, later) for one in labels[labels >= 0]]
+        for path in _chains(sides, prior):
             _continue_chain(rows, track, path, met)
     group = rows.group.copy()
     for one in np.unique(track[track != rows.track]):  # the blur that most rows of it have
@@ -447,8 +445,7 @@ def identified(rows: Localizations, *, near_nm: float, error: float) -> Localiza
     return replace(rows, track=track, group=group).only(track >= 0).in_order()
 
 
-@dataclass(frozen=True)
-class _Part:
+class _Part(NamedTuple):
     """Steps, mass and positions of a track before or after a meeting."""
 
     steps: float
@@ -459,34 +456,26 @@ class _Part:
     places: FloatArray
 
 
-@dataclass(frozen=True)
-class _Typical:
-    """Prior of a particle: step, mass and its variance, from all particles of the movie."""
+class _Prior:
+    """Step, mass and its variance of a particle, from all particles of the movie."""
 
-    step_nm2: float
-    mass: float
-    variance: float
-    near_nm: float
-    error: float
-
-    @classmethod
-    def of(cls, rows: Localizations, near_nm: float, error: float) -> _Typical:
-        """Estimate it from all rows."""
-        step = mean_square(_steps(rows)[1]) / 2
+    def __init__(self, rows: Localizations, near_nm: float, error: float) -> None:
+        self.rows, self._near_nm, self._error = rows, near_nm, error
         mass = rows.theta[:, 3] if len(rows.frame) else np.zeros(1)
         least = (1e-3 * near_nm) ** 2  # of what does not move at all
-        return cls(max(step, least), float(np.median(mass)), float(mass.var()), near_nm, error)
+        self._step_nm2 = max(mean_square(_steps(rows)[1]) / 2, least)
+        self._mass, self._variance = float(np.median(mass)), float(mass.var())
 
-    def part(self, rows: Localizations, mine: IntArray) -> _Part | None:
+    def part(self, mine: IntArray) -> _Part | None:
         """Summarise some rows of a track; None where there are none."""
         if not mine.size:
             return None
-        theta, frame = rows.theta[mine], rows.frame[mine]
+        theta, frame = self.rows.theta[mine], self.rows.frame[mine]
         moved = np.diff(theta[:, :2], axis=0)[np.diff(frame) == 1]
         steps = len(moved) * math.log(2) ** 2  # a median is as good as the mean of so many
         mass = float(np.median(theta[:, 3]))
         # neighbours change all frames of a part by 2 % alike
-        variance = math.pi / 2 * self.error**2 / len(mine) + (0.02 * mass) ** 2
+        variance = math.pi / 2 * self._error**2 / len(mine) + (0.02 * mass) ** 2
         square = steps * mean_square(moved) / 2
         return _Part(steps, square, mass, variance, frame[[0, -1]], theta[[0, -1], :2])
 
@@ -498,24 +487,22 @@ class _Typical:
         if took <= 0:
             return -math.inf  # one particle is not twice in a frame
         distance_squared = float(((after.places[0] - before.places[1]) ** 2).sum()) / (2 * took)
+        steps, square = before.steps + after.steps + 1, before.square + after.square
         moved = (
-            self._marginal(
-                before.steps + after.steps + 1, before.square + after.square + distance_squared
-            )
+            self._marginal(steps, square + distance_squared)
             - self._marginal(before.steps, before.square)
             - self._marginal(after.steps, after.square)
-            + math.log(self.near_nm**2 / (2 * took))
+            + math.log(self._near_nm**2 / (2 * took))
         )
-        known = self.variance / (self.variance + before.variance)
-        mass = self.mass + known * (before.mass - self.mass)
-        variance = known * before.variance + after.variance
-        weighed = _normal(after.mass - mass, variance)
-        return moved + weighed - _normal(after.mass - self.mass, self.variance + after.variance)
+        known = self._variance / (self._variance + before.variance)
+        mass = self._mass + known * (before.mass - self._mass)
+        weighed = _normal(after.mass - mass, known * before.variance + after.variance)
+        return moved + weighed - _normal(after.mass - self._mass, self._variance + after.variance)
 
     def _marginal(self, steps: float, square: float) -> float:
         """Log-likelihood of steps whatever their variance, but for (2π)^−N."""
-        prior = math.log(self.step_nm2)
-        return math.lgamma(steps + 1) + prior - (steps + 1) * math.log(self.step_nm2 + square)
+        prior = math.log(self._step_nm2)
+        return math.lgamma(steps + 1) + prior - (steps + 1) * math.log(self._step_nm2 + square)
 
 
 def _normal(off: float, variance: float) -> float:
@@ -530,39 +517,26 @@ class _Meeting(NamedTuple):
     pairs: IntArray
 
 
-@dataclass(frozen=True, eq=False)
 class _Side:
-    """A track in a meeting: its parts before and after, and whether it begins or ends there."""
+    """A track in a meeting: its parts before and after, and whether it begins or ends there.
 
-    track: int
-    first: int
-    last: int
-    before: _Part | None
-    after: _Part | None
-    begins: bool
-    ends: bool
+    `later` are the rows of the meetings that follow.
+    """
 
-
-def _track_side(
-    rows: Localizations,
-    track: IntArray,
-    one: int,
-    met: _Meeting,
-    later: BoolArray,
-    typical: _Typical,
-) -> _Side:
-    """Summarise one track of a meeting; `later` are the rows of the meetings that follow."""
-    mine = np.flatnonzero(track == one)
-    frame = rows.frame[mine]
-    first, last = rows.frame[met.rows[track[met.rows] == one]][[0, -1]].tolist()
-    until = frame[later[mine] & (frame > last)].min(initial=int(frame[-1]) + 1)
-    before = typical.part(rows, mine[frame < first])
-    after = typical.part(rows, mine[(frame > last) & (frame < until)])
-    begins, ends = first - frame[0] <= _APART_FRAMES, frame[-1] - last <= _APART_FRAMES
-    return _Side(one, first, last, before, after, bool(begins), bool(ends))
+    def __init__(
+        self, prior: _Prior, track: IntArray, number: int, met: _Meeting, later: BoolArray
+    ) -> None:
+        self.track, rows, mine = number, prior.rows, np.flatnonzero(track == number)
+        frame, there = rows.frame[mine], rows.frame[met.rows[track[met.rows] == number]]
+        self.first, self.last = first, last = there[[0, -1]].tolist()
+        until = frame[later[mine] & (frame > last)].min(initial=int(frame[-1]) + 1)
+        self.before = prior.part(mine[frame < first])
+        self.after = prior.part(mine[(frame > last) & (frame < until)])
+        self.begins = bool(first - frame[0] <= _APART_FRAMES)
+        self.ends = bool(frame[-1] - last <= _APART_FRAMES)
 
 
-def _chains(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
+def _chains(sides: list[_Side], prior: _Prior) -> Iterator[list[_Side]]:
     """Find tracks whose continuations are exchanged, by the assignment with the most evidence.
 
     In a chain each track is continued by the rows that the next track has after the meeting.  Where
@@ -573,7 +547,7 @@ def _chains(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
     go = [side for side in sides if not side.ends]
     if not come or not go:
         return
-    gain = LEAST_GAIN + np.array([[typical.evidence(a.before, b.after) for b in go] for a in come])
+    gain = LEAST_GAIN + np.array([[prior.evidence(a.before, b.after) for b in go] for a in come])
     linked = np.array([[a is b for b in go] for a in come])
     # what fits nothing may end or begin here if it does, and else goes on all the same
     least = np.array([[0.0 if a.ends or b.begins else -1e9 for b in go] for a in come])

@@ -8,15 +8,15 @@ is not theirs alone yet: the sign of the contrast is the model's.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.records import BoolArray, FloatArray, IntArray
+from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.search.peaks import SAMPLED, maxima, summits
 from iscat_analysis.search.templates import FAR_LOBE, NEAR, SIDELOBE, Templates
 from iscat_analysis.tracking.field import MovingField
@@ -30,26 +30,6 @@ has been taken off: less may be what the model leaves over."""
 
 _HIGHER = 2.5
 """What rings may be through optics that are not the model's, over those of the model."""
-
-
-class FrameCandidates(NamedTuple):
-    """Candidates in frames, in the order of the frames."""
-
-    frame: IntArray
-    x_px: FloatArray
-    y_px: FloatArray
-    z_nm: FloatArray
-    strength: FloatArray
-    snr: FloatArray
-
-    @classmethod
-    def together(cls, parts: Iterable[FrameCandidates]) -> FrameCandidates:
-        """Concatenate several sets of candidates."""
-        return cls(*map(np.concatenate, zip(*parts, strict=True)))
-
-    def only(self, kept: IntArray | BoolArray) -> FrameCandidates:
-        """Select some candidates."""
-        return FrameCandidates._make(part[kept] for part in self)
 
 
 class FrameFilter:
@@ -86,13 +66,9 @@ class FrameFilter:
         self._duals = rfft2(flipped[self._layers].astype(np.float32), self._padded)
 
     def find(
-        self,
-        residual_e: NDArray[np.float32],
-        power: FloatArray,
-        first: int,
-        known: list[FloatArray],
-    ) -> FrameCandidates:
-        """Find candidates in a block of frames.
+        self, residual_e: NDArray[np.float32], power: FloatArray, known: list[FloatArray]
+    ) -> Localizations:
+        """Find candidates in a block of frames, numbered from 0; their places are in pixels.
 
         Shapes: `residual_e` (n, y, x), `power` (n,), `known` (k, 3).
         """
@@ -102,10 +78,10 @@ class FrameFilter:
             here = slice(start, start + at_once)
             tops = self._peaks(residual_e[here], power[here])
             tops = tops.only(self._alone(tops, known[here]))
-            parts.append(tops._replace(frame=tops.frame + first + start))
-        return FrameCandidates.together(parts)
+            parts.append(replace(tops, frame=tops.frame + start))
+        return Localizations.together(parts)
 
-    def _peaks(self, residual_e: NDArray[np.float32], power: FloatArray) -> FrameCandidates:
+    def _peaks(self, residual_e: NDArray[np.float32], power: FloatArray) -> Localizations:
         """Find the peaks above the threshold, the highest of each frame first."""
         threshold = self._templates.threshold
         spectrum = rfft2(residual_e * self._share, self._padded)[:, None]
@@ -118,12 +94,13 @@ class FrameFilter:
         dy, dx, above = summits(snr.reshape(-1, *snr.shape[2:]), at)
         height = best[frame, row, column] + above
         strength = height / (np.sqrt(power[frame]) * self._norm[layer, row, column])
-        z_nm = self._templates.z_nm[self._layers[layer]]
+        z_nm, nothing = self._templates.z_nm[self._layers[layer]], np.zeros(len(frame))
+        theta = np.column_stack([column + dx, row + dy, z_nm, strength, nothing])
         order = np.lexsort((-column, -row, -layer, -height, frame))
-        order = order[height[order] > threshold]
-        return FrameCandidates(frame, column + dx, row + dy, z_nm, strength, height).only(order)
+        tops = replace(Localizations.of(frame, np.full(len(frame), -1), theta), snr=height)
+        return tops.only(order[height[order] > threshold])
 
-    def _alone(self, tops: FrameCandidates, known: list[FloatArray]) -> BoolArray:
+    def _alone(self, tops: Localizations, known: list[FloatArray]) -> BoolArray:
         """Tell which peaks are neither side lobes nor residues.
 
         The highest peaks of each frame come first.  In each round the highest remaining peak of
@@ -140,21 +117,21 @@ class FrameFilter:
             left = left[~(begins | hides)]
         return kept
 
-    def _is_lobe(self, one: FrameCandidates, other: FrameCandidates) -> BoolArray:
+    def _is_lobe(self, one: Localizations, other: Localizations) -> BoolArray:
         """Tell which peaks may be side lobes of higher ones."""
-        apart_x, apart_y = one.x_px - other.x_px, one.y_px - other.y_px
-        within_region = np.maximum(np.abs(apart_x), np.abs(apart_y)) < self._roi_px
+        apart = one.theta[:, :2] - other.theta[:, :2]
+        within_region = np.abs(apart).max(axis=1) < self._roi_px
         lobe = one.snr < other.snr * np.where(within_region, self._lobe, FAR_LOBE)
-        lobe |= np.hypot(apart_x, apart_y) < NEAR * self._roi_px
+        lobe |= np.hypot(*apart.T) < NEAR * self._roi_px
         return np.asarray(lobe | within_region if self._cautious else lobe)
 
-    def _are_left_over(self, tops: FrameCandidates, known: list[FloatArray]) -> BoolArray:
+    def _are_left_over(self, tops: Localizations, known: list[FloatArray]) -> BoolArray:
         """Tell which peaks may be residues of particles that were fitted already."""
         places = np.full((len(known), max(map(len, known)), 3), np.nan)
         for row, there in zip(places, known, strict=True):
             row[: len(there)] = there
         known_x, known_y, known_height = np.moveaxis(places[tops.frame], 2, 0)
-        away = np.hypot(known_x - tops.x_px[:, None], known_y - tops.y_px[:, None])
+        away = np.hypot(known_x - tops.theta[:, :1], known_y - tops.theta[:, 1:2])
         if self._cautious:
             return np.asarray((away < self._roi_px).any(axis=1))
         over = (away < NEAR * self._roi_px) & (tops.snr[:, None] < LEFT_OVER * known_height)
@@ -192,7 +169,7 @@ def search_frames(
     *,
     enough: int = 0,
     cautious: bool = False,
-) -> FrameCandidates:
+) -> Localizations:
     """Find candidates in the residual of the rows so far."""
     side = context.roi_px
     if context.mode == "joint":
@@ -205,11 +182,13 @@ def search_frames(
     places = np.column_stack([rows.theta[:, :2] / field.pixel_nm, rows.snr])
     begin, end = frames or (0, field.frames)
 
-    def block(first: int) -> FrameCandidates:
+    def block(first: int) -> Localizations:
         last = min(first + _BLOCK, end)
         known = [places[starts[t] : starts[t + 1]] for t in range(first, last)]
         left = field.residual(ground, rows, first, last)
-        return search.find(left, ground.power[first:last], first, known)
+        found = search.find(left, ground.power[first:last], known)
+        theta = found.theta * [field.pixel_nm, field.pixel_nm, 1, 1, 1]
+        return replace(found, frame=found.frame + first, theta=theta)
 
     blocks = range(begin, end, _BLOCK)
     sample = blocks[:: _SAMPLED if enough else 1]
@@ -218,4 +197,4 @@ def search_frames(
     if sum(len(part.frame) for part in parts.values()) > enough / _SAMPLED:
         others = [first for first in blocks if first not in parts]
         parts |= zip(others, mapper(block, others), strict=True)
-    return FrameCandidates.together(parts[first] for first in sorted(parts))
+    return Localizations.together([parts[first] for first in sorted(parts)])

@@ -63,28 +63,22 @@ from iscat_analysis.tracking.linking import (
     typical_error,
 )
 from iscat_analysis.tracking.rows import BackgroundEstimate, Judged, Localizations
-from iscat_analysis.tracking.search import FrameCandidates, search_frames
+from iscat_analysis.tracking.search import search_frames
 
 
 def decide_heights(
-    field: MovingField,
-    ground: BackgroundEstimate,
-    rows: Localizations,
-    *,
-    fringe_nm: float,
-    z_range_nm: tuple[float, float],
+    field: MovingField, ground: BackgroundEstimate, rows: Localizations
 ) -> Localizations:
     """Choose the interference fringe of every row by the likelihood of its whole track."""
     if not len(rows.frame):
         return rows
     rank = np.arange(len(rows.frame)) - rows.starts(field.frames)[rows.frame]
-    rungs = 2 * math.ceil(np.ptp(z_range_nm) / fringe_nm) + 5
+    rungs = 2 * math.ceil(np.ptp(field.heights_nm) / field.fringe_nm) + 5
     candidates = np.repeat(rows.theta[:, None], rungs, axis=1)
     values = np.full((len(rows.frame), rungs), -np.inf)
     for turn in range(int(rank.max()) + 1):  # one particle of each frame climbs at a time
         mine = rank == turn
-        ladder = _ladder(field, ground, rows, mine, fringe_nm, z_range_nm)
-        for rung, (fitted, gain) in enumerate(ladder):
+        for rung, (fitted, gain) in enumerate(_ladder(field, ground, rows, mine)):
             candidates[mine, rung], values[mine, rung] = fitted, gain
     # Where no fit converged, the other rows of the track decide.
     values[~np.isfinite(values).any(axis=1)] = 0.0
@@ -94,26 +88,21 @@ def decide_heights(
         apart = np.diff(rows.frame[mine])
         step = np.diff(rows.theta[mine, :2], axis=0) / np.sqrt(2 * apart)[:, None]
         # no particle is taken to move by less than 0.05 fringes between two frames
-        per_frame = max(mean_square(step), (0.05 * fringe_nm) ** 2)
+        per_frame = max(mean_square(step), (0.05 * field.fringe_nm) ** 2)
         path = _best_path(candidates[mine, :, 2], values[mine], per_frame * apart)
         out[mine] = candidates[mine, path]
     return replace(rows, theta=out)
 
 
 def _ladder(
-    field: MovingField,
-    ground: BackgroundEstimate,
-    rows: Localizations,
-    climbs: BoolArray,
-    fringe_nm: float,
-    z_range_nm: tuple[float, float],
+    field: MovingField, ground: BackgroundEstimate, rows: Localizations, climbs: BoolArray
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Fit some rows in every fringe, each fit starting from the one in the fringe before.
 
     The other rows of their frames stay as they are.  Yields what was fitted, shape (n, 5), and its
     log-likelihood, (n,).
     """
-    low, high = z_range_nm
+    fringe_nm, (low, high) = field.fringe_nm, field.heights_nm
     with_others = np.isin(rows.frame, rows.frame[climbs])
     rows, mine = rows.only(with_others), climbs[with_others]
     usual = typical(rows).theta[:, 3]
@@ -230,11 +219,7 @@ class Task:
         """Choose the interference fringe of every row by its track, where heights are free."""
         if not self.heights_free:
             return state
-        fringe_nm, z_range_nm = self.context.model.fringe_nm, self.config.fit.z_range_nm
-        rows = decide_heights(
-            self.field, state.ground, state.rows, fringe_nm=fringe_nm, z_range_nm=z_range_nm
-        )
-        return replace(state, rows=rows)
+        return replace(state, rows=decide_heights(self.field, state.ground, state.rows))
 
     def blurred(self, state: State) -> State:
         """Give tracks the blur that their D makes."""
@@ -275,17 +260,12 @@ def search(task: Task, state: State) -> State:
     """Look for particles in what the fits so far leave over, until little is added."""
     for number in range(ROUNDS):
         before = len(state.rows.frame)
-        found = search_frames(
-            task.context,
-            task.field,
-            state.ground,
-            state.rows,
-            enough=round(_FEW * before) if number >= _FULL else 0,
-            cautious=task.cautious,
-        )
+        enough = round(_FEW * before) if number >= _FULL else 0
+        where = task.context, task.field, state.ground, state.rows
+        found = search_frames(*where, enough=enough, cautious=task.cautious)
         if number and len(found.frame) <= _FEW * before:
             break
-        rows = _joined(task.context, state.rows, found)
+        rows = _joined(state.rows, found)
         # from 1.5 rows in a frame on, trackpy will link some
         if len(rows.frame) > 1.5 * len(np.unique(rows.frame)):
             start_in_thread(load_linker)  # there will be a choice
@@ -412,13 +392,9 @@ def _judged(task: Task, state: State) -> TrackedRows:
         unlike = shared_mass & crowded(rows, task.context.roi_px * task.context.pixel_nm)
     counted = state.done & field.holds(rows.theta) & ~near & ~unlike
     common = common_amplitudes(field, ground, rows, judged, counted)
-    found: dict[str, Any] = {
-        "judged": judged,
-        "close": near | shared_mass,
-        "field": field,
-        "common": common,
-    }
-    return TrackedRows(**vars(state), **found, shared=shared_errors(field, ground, rows, judged))
+    shared = shared_errors(field, ground, rows, judged)
+    found: dict[str, Any] = {"judged": judged, "field": field, "shared": shared, "common": common}
+    return TrackedRows(**vars(state), **found, close=near | shared_mass)
 
 
 def _refuse_flood(task: Task, rows: Localizations) -> None:
@@ -435,16 +411,12 @@ def _refuse_flood(task: Task, rows: Localizations) -> None:
         )
 
 
-def _joined(context: AnalysisContext, rows: Localizations, found: FrameCandidates) -> Localizations:
+def _joined(rows: Localizations, found: Localizations) -> Localizations:
     """Add candidates to the rows as starting points of fits."""
-    n = len(found.frame)
-    pixel = context.pixel_nm
-    theta = np.column_stack(
-        [found.x_px * pixel, found.y_px * pixel, found.z_nm, found.strength, np.zeros(n)]
-    )
-    unknown = replace(rows, track=np.full(len(rows.frame), -1))
-    blur = int(np.bincount(rows.group).argmax()) if len(rows.group) else 0
-    return unknown.joined(found.frame, np.full(n, -1), theta, np.full(n, blur, dtype=np.int64))
+    blur = np.bincount(rows.group).argmax() if len(rows.group) else 0
+    found = replace(found, group=np.full_like(found.group, blur))
+    unknown = replace(rows, track=np.full_like(rows.track, -1))
+    return Localizations.together([unknown, found]).in_order()
 
 
 def _credible(task: Task, rows: Localizations, done: BoolArray) -> Localizations:

@@ -28,7 +28,7 @@ from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.run import RESUMPTION_HINT, partial_folder
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline import analyse, fit_stack
-from iscat_analysis.records import silent
+from iscat_analysis.records import Windows, silent
 from iscat_analysis.threads import threads
 from iscat_analysis.tracking.blocks import Block, combine_masses, join_tracks
 from iscat_analysis.tracking.frames import (
@@ -206,12 +206,14 @@ def _block(span: tuple[int, int], tracks: list[tuple[range, float, float, float]
     frame = np.concatenate([np.array(t, dtype=np.int64) for t, *_ in tracks])
     track = np.repeat(np.arange(len(tracks)), [len(t) for t, *_ in tracks])
     theta = np.array([[*tracks[k][1:3], 5.0, tracks[k][3], 0.0] for k in track])
-    nothing = np.zeros((4, 4))
+    nothing, n = np.zeros((4, 4)), span[1] - span[0]
     return Block(
         span=span, rows=Localizations.of(frame, track, theta), error=1.0, table=pd.DataFrame(),
         inside=np.ones(len(frame), dtype=bool), masses=pd.DataFrame(), views=(),
-        level=nothing, power=np.ones(span[1] - span[0]), total_e=nothing, used=nothing == 0,
-        saturated=nothing > 0,
+        windows=Windows(
+            nothing, nothing, n, n, 1.0, nothing, nothing, nothing > 0, nothing > 0, span, span,
+            np.ones(2 * n),
+        ),
     )  # fmt: skip
 
 

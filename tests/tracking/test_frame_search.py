@@ -9,7 +9,8 @@ from scenes import PIXEL_NM, make_config
 from iscat_analysis.config import Config
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.tracking.frames import tracking_context
-from iscat_analysis.tracking.search import FrameCandidates, FrameFilter
+from iscat_analysis.tracking.rows import Localizations
+from iscat_analysis.tracking.search import FrameFilter
 
 SIDE, ROI, LEVEL_E = 96, 32, 4e5
 
@@ -27,7 +28,7 @@ def _config(**aberrations_nm: float) -> Config:
 
 def _found(
     config: Config, particles: list[tuple[float, float, float]], *, seen_through: Config
-) -> FrameCandidates:
+) -> Localizations:
     """Search a frame with particles (x, y [pixels], mass), made through some optics."""
     context = tracking_context(config, (SIDE, SIDE), 1000)
     picture = tracking_context(seen_through, (SIDE, SIDE), 1000).wide
@@ -42,7 +43,7 @@ def _found(
         context.templates, level, np.zeros_like(level), np.ones(level.shape, dtype=bool),
         polarity=config.detection.sign, roi_px=context.roi_px, cautious=False,
     )  # fmt: skip
-    return search.find((counts - level)[None].astype(np.float32), np.ones(1), 0, [np.zeros((0, 3))])
+    return search.find((counts - level)[None].astype(np.float32), np.ones(1), [np.zeros((0, 3))])
 
 
 @pytest.mark.parametrize("away", [13.0, 18.0, 25.0])
@@ -50,7 +51,7 @@ def test_a_faint_particle_beside_a_bright_one_is_found_at_once(away):
     config = _config()
     found = _found(config, [(40.0, 48.0, 400.0), (40.0 + away, 48.0, 170.0)], seen_through=config)
     assert len(found.frame) == 2
-    np.testing.assert_allclose(found.x_px, [40.0, 40.0 + away], atol=0.5)
+    np.testing.assert_allclose(found.theta[:, 0], [40.0, 40.0 + away], atol=0.5)
 
 
 @pytest.mark.parametrize("mass", [400.0, 4000.0])

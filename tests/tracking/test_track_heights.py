@@ -55,7 +55,7 @@ def test_rows_come_into_their_fringe(
         ground = BackgroundEstimate(np.full(SHAPE, LEVEL_E), np.ones(FRAMES))
         rows = Localizations.of(frames, track, start)
         alone, _, _ = field.fit(ground, rows)
-        found = decide_heights(field, ground, rows, fringe_nm=model.fringe_nm, z_range_nm=span)
+        found = decide_heights(field, ground, rows)
     jumped = np.abs(alone.theta[:, 2] - path[:, 2]) > model.fringe_nm / 2
     assert jumped.sum() > FRAMES / 4
     assert np.abs(found.theta[:, 2] - path[:, 2]).max() < model.fringe_nm / 4
