@@ -133,15 +133,7 @@ def landing_particle_images(
             chunk = reader.tile_chunk(sums.part(part.tile.here), part.tile, stride, pool)
         wanted = config.background.follows_pattern
         chunk, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
-        steps = find_bright_steps(
-            chunk,
-            window,
-            pixel_nm=_pixel_nm(config),
-            resolution_nm=config.optics.wavelength_nm / config.optics.na,
-            roi_px=_roi_px(config),
-            motion=pattern,
-            mapper=pool.map,
-        )
+        steps = find_bright_steps(chunk, window, config, motion=pattern, mapper=pool.map)
         found += _in_field(steps.alone(most), part.tile)
         rest += _in_field(steps.every() if rings else (), part.tile)
         bright = [step for step in found if step.snr > FAINTEST]
@@ -370,10 +362,11 @@ def _particle_image_of(
 ) -> ParticleImage:
     """Make an image of a step among others, whose rings may change while its frames are summed."""
     grid = PixelGrid.region(step.rows, step.columns, _pixel_nm(config))
-    reads = step.n_before * step.read_variance_e2, step.n_after * step.read_variance_e2
-    counts = step.before_e, step.after_e, step.power_ratio * step.motion
-    likelihood = conditional(model, grid, *counts, read_variances_e2=reads, masked=~step.usable)
-    frames = sum(step.frames_before) / 2, sum(step.frames_after) / 2
+    windows = step.windows
+    reads = windows.read_variance_before_e2, windows.read_variance_after_e2
+    counts = windows.before_e, windows.after_e, windows.power_ratio * step.motion
+    likelihood = conditional(model, grid, *counts, read_variances_e2=reads, masked=windows.masked)
+    frames = sum(windows.frames_before) / 2, sum(windows.frames_after) / 2
     near = []
     for number, other in enumerate(others):
         apart = math.hypot(step.x_px - other.x_px, step.y_px - other.y_px) * grid.pixel_nm
@@ -381,7 +374,7 @@ def _particle_image_of(
             continue
         before, after = (
             (stop - min(max(other.frame, start), stop)) / max(stop - start, 1)
-            for start, stop in (step.frames_before, step.frames_after)
+            for start, stop in (windows.frames_before, windows.frames_after)
         )
         if after > before:
             near.append((number, after - before))

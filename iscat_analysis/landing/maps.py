@@ -48,10 +48,10 @@ class StepMaps:
             maps = self._maps or sliding_maps(
                 self._chunk, self.matched, STRIDES, in_place=self._chunk.lends_blocks, mapper=mapper
             )
-            for step in _missing(self._known, steps):
-                self._add(maps, step, 1.0)
-            for step in _missing(steps, self._known):
-                self._add(maps, step, -1.0)
+            old, now = set(self._known), set(steps)
+            for step in (*self._known, *steps):
+                if step not in old or step not in now:
+                    self._add(maps, step, 1.0 if step in old else -1.0)
         else:
             maps = self._anew(steps, mapper)
         self._maps, self._known = maps, list(steps)
@@ -101,7 +101,7 @@ class StepMaps:
         changed = [
             j
             for j, (old, now) in enumerate(zip(self._near or near, near, strict=True))
-            if _ids(old) != _ids(now)
+            if {*old} != {*now}
         ]
         self._near = near
         return sliding_maps(
@@ -114,17 +114,6 @@ class StepMaps:
 def maps_are_local(context: AnalysisContext, *, moving: bool) -> bool:
     """Whether a step changes the maps near it alone, so that nobody makes them again."""
     return not moving and context.lines is None and context.templates.noise is None
-
-
-def _ids(steps: Sequence[Step]) -> set[int]:
-    """Give the identities of steps; one that was fitted again is another object."""
-    return {id(step) for step in steps}
-
-
-def _missing(some: Sequence[Step], others: Sequence[Step]) -> list[Step]:
-    """Give the steps of one list that are not in another."""
-    there = _ids(others)
-    return [step for step in some if id(step) not in there]
 
 
 @dataclass(frozen=True)

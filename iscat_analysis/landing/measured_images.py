@@ -35,7 +35,6 @@ from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import Candidate, FitResult, FloatArray, Mapper
 from iscat_analysis.search.bright import BrightStep, find_bright_steps
 from iscat_analysis.search.dating import StepFrame
-from iscat_analysis.search.frames import Chunk
 from iscat_analysis.search.peaks import RINGS, chi2_excess, summits
 from iscat_analysis.search.sliding import STRIDES
 
@@ -49,31 +48,24 @@ def large_steps(neighbours: Neighbours, mapper: Mapper) -> tuple[list[Step], boo
 
     With wrong optics dipoles describe no bright step, and spheres neither.
     """
-    context, chunk = neighbours.context, neighbours.chunk
+    context = neighbours.context
     if not context.spheres_of(context.model):
         return [], False
-    optics = context.config.optics
-    bright = find_bright_steps(
-        chunk,
-        neighbours.window,
-        pixel_nm=context.pixel_nm,
-        resolution_nm=optics.wavelength_nm / optics.na,
-        roi_px=context.roi_px,
-        mapper=mapper,
-    )
+    chunk, window = neighbours.chunk, neighbours.window
+    bright = find_bright_steps(chunk, window, context.config, mapper=mapper)
     clear = takewhile(lambda step: step.snr >= BRIGHT_SNR, bright.every())
     nominal, z_range = context.model.material.mass_kda, context.config.fit.z_range_nm
 
     def tried(step: BrightStep) -> list[tuple[int, Likelihood, FitResult]] | None:
         """Fit spheres that land or leave; None where a dipole suffices."""
-        landing = _likelihood_of(context, chunk, step, 1)
+        landing = _likelihood_of(context, step, 1)
         start = Candidate(step.x_px, step.y_px, context.height_nm(nominal), nominal, step.snr)
         dipole = fit_particle(landing, start, context.mode, z_range, level=True)
         if not may_be_large(landing, dipole):
             return None
         found = []
         for sign in (1, -1):
-            likelihood = landing if sign > 0 else _likelihood_of(context, chunk, step, sign)
+            likelihood = landing if sign > 0 else _likelihood_of(context, step, sign)
             spheres = context.spheres_of(likelihood.model)
             sphere = recognised(likelihood, dipole, spheres, z_range, level=True)
             if sphere is not None:
@@ -93,28 +85,18 @@ def large_steps(neighbours: Neighbours, mapper: Mapper) -> tuple[list[Step], boo
     return steps, not steps and failed >= IN_VAIN
 
 
-def _likelihood_of(
-    context: AnalysisContext, chunk: Chunk, step: BrightStep, sign: int
-) -> Likelihood:
+def _likelihood_of(context: AnalysisContext, step: BrightStep, sign: int) -> Likelihood:
     """Make the likelihood of a step that lands or leaves, in the square that is fitted at most."""
     rows, columns = (_middle(part, context.roi_px) for part in (step.rows, step.columns))
-    inside = (
-        slice(rows[0] - step.rows[0], rows[1] - step.rows[0]),
-        slice(columns[0] - step.columns[0], columns[1] - step.columns[0]),
-    )
-    grid = PixelGrid.region(rows, columns, context.pixel_nm)
-    before, after, ratio = step.before_e[inside], step.after_e[inside], step.power_ratio
-    frames = [step.n_before, step.n_after]
-    if sign < 0:
-        before, after, ratio = after, before, 1 / ratio
-        frames.reverse()
-    read = chunk.camera.read_variance_e2(chunk.shape)[slice(*rows), slice(*columns)]
-    place = step.x_px * context.pixel_nm, step.y_px * context.pixel_nm
-    return conditional(
-        context.model_at(*place, step.frame), grid, before, after, ratio,
-        read_variances_e2=(frames[0] * read, frames[1] * read),
-        masked=~step.usable[inside],
-    )  # fmt: skip
+    (top, bottom), (left, right) = rows, columns
+    y, x = step.rows[0], step.columns[0]
+    windows = step.windows.cut((slice(top - y, bottom - y), slice(left - x, right - x)))
+    before, after = (windows.before_e, windows.after_e)[::sign]
+    one, other = (windows.read_variance_before_e2, windows.read_variance_after_e2)[::sign]
+    model = context.model_at(step.x_px * context.pixel_nm, step.y_px * context.pixel_nm, step.frame)
+    grid, ratio = PixelGrid.region(rows, columns, context.pixel_nm), windows.power_ratio**sign
+    counts = before, after, ratio
+    return conditional(model, grid, *counts, read_variances_e2=(one, other), masked=windows.masked)
 
 
 def _middle(span: tuple[int, int], most: int) -> tuple[int, int]:
@@ -183,12 +165,11 @@ def _measured(step: Step, others: Sequence[Step], neighbours: Neighbours) -> Ste
     begin, end = max(frame - window, chunk.first), min(frame + window, chunk.stop)
     spans = (begin, max(frame - gap, begin)), (min(frame + gap, end), end)
     patch = chunk.patch(begin, end, rows, columns)
-    (before, n_before, power_before), (after, n_after, power_after) = (
-        patch.window(*span) for span in spans
-    )
-    if not n_before or not n_after:
+    windows = patch.windows(*spans)
+    if not windows.n_before or not windows.n_after:
         return step
-    ratio = np.full(before.shape, power_after / power_before)
+    before, after = windows.before_e, windows.after_e
+    ratio = np.full(before.shape, windows.power_ratio)
     cuts = chunk.cut(*spans[0]), chunk.cut(*spans[1])
     for other in others:
         neighbours.apply(ratio, other, *cuts, Region(rows, columns))

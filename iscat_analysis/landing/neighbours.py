@@ -81,9 +81,9 @@ class Drawn:
         return values
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Step:
-    """One particle that lands or leaves."""
+    """One particle that lands or leaves; one that was fitted again is another step."""
 
     sign: int
     at: StepFrame

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iscat_analysis.camera import Camera
 from iscat_analysis.fitting.context import AnalysisContext
@@ -172,40 +170,6 @@ def _cuts(chunk: Chunk, start: int, stop: int) -> Iterator[slice]:
 # ---- background frames -----------------------------------------------------------------------
 
 
-class _Own:
-    """The frames of one event, as they are read."""
-
-    def __init__(self, event: Event, camera: Camera) -> None:
-        self._here = event.region.slices
-        self._response, self._camera = _response(event), camera.part(self._here)
-        self._sides: tuple[list[Series], list[Series]] = [], []
-
-    def add(
-        self, side: int, counts: NDArray[Any], power: FloatArray, mean: FloatArray, read: FloatArray
-    ) -> None:
-        """Weigh some frames before or after.
-
-        Shapes: `counts` (t, y, x), `power` (t,), `mean, read` (y, x).
-        """
-        if self._response is not None:
-            one = series_of(
-                counts[(slice(None), *self._here)],
-                (self._response.before, self._response.after)[side],
-                power,
-                gain=self._camera.gain_e_per_adu,
-                offset=self._camera.offset_adu,
-                mean_e=mean[self._here],
-                read_variance_e2=read[self._here],
-            )
-            self._sides[side].append(one)
-
-    def repeats(self, mode: str) -> FloatArray:
-        """Compare the parts."""
-        if self._response is None:
-            return nothing_repeated(mode)
-        return repeats_of(tuple(_joined(side) for side in self._sides if side))
-
-
 def field_repeats(
     context: AnalysisContext,
     movie: Stack,
@@ -218,7 +182,8 @@ def field_repeats(
         return [], None
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
     read = camera.read_variance_e2(shape)
-    owns = [_Own(event, camera) for event in events]
+    responses = [_response(event) for event in events]
+    series: list[tuple[list[Series], list[Series]]] = [([], []) for _ in events]
     spans = (windows.frames_before, windows.frames_after)
     n_before = windows.n_before
     power = windows.power
@@ -256,8 +221,18 @@ def field_repeats(
             total = np.zeros(shape)
             for first, counts in movie.chunks(span[0] + a, span[0] + b, memory_mb=4.0):
                 start = first - span[0]
-                for own in owns:
-                    own.add(side, counts, power[start : start + len(counts)], mean, read)
+                for event, response, own in zip(events, responses, series, strict=True):
+                    if response is None:
+                        continue
+                    here = event.region.slices
+                    part, weights = camera.part(here), (response.before, response.after)[side]
+                    of_frames = power[start : start + len(counts)]
+                    one = series_of(
+                        counts[(slice(None), *here)], weights, of_frames,
+                        gain=part.gain_e_per_adu, offset=part.offset_adu, mean_e=mean[here],
+                        read_variance_e2=read[here],
+                    )  # fmt: skip
+                    own[side].append(one)
                 if field is not None:
                     total += camera.to_electrons(counts).sum(axis=0)
             if field is not None:
@@ -269,7 +244,9 @@ def field_repeats(
         light = np.array(lights[0]), np.array(lights[1])
         left = field.left([(event.candidate.x_px, event.candidate.y_px) for event in events])
         empty = field.spread(parts[0], parts[1], light, taken, left)
-    return [own.repeats(context.mode) for own in owns], empty
+    nothing = nothing_repeated(context.mode)
+    joined = [[_joined(side) for side in own if side] for own in series]
+    return [repeats_of(tuple(own)) if own else nothing for own in joined], empty
 
 
 def _joined(series: Sequence[Series]) -> Series:

@@ -109,7 +109,7 @@ class ChunkFitter:
             new = relevant.intersection(range(known, len(steps)))
             chosen = new
             for _ in range(10):  # over what has neighbours that still move
-                improved = self._improve(steps, chosen, seen)
+                improved = self._refitted(self._improved, steps, chosen, seen)
                 moved = {i for i in chosen if _has_moved(steps[i], improved[i])}
                 steps = improved
                 chosen = {i for i in relevant if moved.intersection(bound[i])}
@@ -121,12 +121,11 @@ class ChunkFitter:
             }
             if rise != self._tasks.rise:
                 self._tasks.rise = rise
-                steps = self._improve(steps, relevant, seen)
+                steps = self._refitted(self._improved, steps, relevant, seen)
             if "z_nm" in FREE_PARAMETERS[self._context.mode]:
-                steps = self._lifted(steps, new, seen)
+                steps = self._refitted(self._lifted, steps, new, seen)
             credible = self._credible(steps)
-            kept = {id(s) for s in credible}
-            rejected += [s for s in steps if id(s) not in kept]
+            rejected += {*steps}.difference(credible)
             if steps := credible:
                 near = self.neighbours.of(steps)[0]
                 steps = with_measured_images(steps, near, self.neighbours)
@@ -219,55 +218,42 @@ class ChunkFitter:
         """Whether a step is in the core of a tile, or nearer to it than a margin."""
         return bool(is_within(self.own, step.start.y_px, step.start.x_px, margin_px))
 
-    def _improve(
-        self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]
-    ) -> list[Step]:
-        """Fit the chosen steps at their present heights, with the others fixed."""
+    def _improved(self, step: Step, task: Task) -> Step:
+        """Fit a step at its present height."""
+        if step.sphere is not None:
+            likelihood, fit = refitted(task.likelihood, *step.sphere, level=True)
+            excess = chi2_excess(likelihood.residuals(fit.theta))
+            return self.neighbours.draw_sphere(
+                step.sign, task.at, model_of(likelihood), fit, excess
+            )
+        likelihood, start = task.likelihood, task.displaced(self._seated(step))
+        begin, z_range = start_theta(likelihood, start), self._context.config.fit.z_range_nm
+        box = search_box(likelihood, begin, self._quick_mode, z_range, level=True)
+        theta = begin if step.theta is None else step.theta.copy()
+        if not box.free[2]:
+            theta[2] = start.z_nm
+        theta = np.where(box.free, np.clip(theta, box.lower, box.upper), theta)
+        best = likelihood.maximize(theta, box)
+        if likelihood.model.scale.mass(best.theta[3]) <= 0:
+            return replace(step, at=task.at, snr=0.0)
+        return self._moved(step, task, best.theta, detection_snr(likelihood, best, box))
+
+    def _lifted(self, step: Step, task: Task) -> Step:
+        """Fit a step at all heights, so that the rings fit too."""
+        start, mode = task.displaced(step.start), self._context.mode
         z_range = self._context.config.fit.z_range_nm
-
-        def fitted(step: Step, task: Task) -> Step:
-            if step.sphere is not None:
-                likelihood, fit = refitted(task.likelihood, *step.sphere, level=True)
-                excess = chi2_excess(likelihood.residuals(fit.theta))
-                return self.neighbours.draw_sphere(
-                    step.sign, task.at, model_of(likelihood), fit, excess
-                )
-            likelihood, start = task.likelihood, task.displaced(self._seated(step))
-            begin = start_theta(likelihood, start)
-            box = search_box(likelihood, begin, self._quick_mode, z_range, level=True)
-            theta = begin if step.theta is None else step.theta.copy()
-            if not box.free[2]:
-                theta[2] = start.z_nm
-            theta = np.where(box.free, np.clip(theta, box.lower, box.upper), theta)
-            best = likelihood.maximize(theta, box)
-            if likelihood.model.scale.mass(best.theta[3]) <= 0:
-                return replace(step, at=task.at, snr=0.0)
-            return self._moved(step, task, best.theta, detection_snr(likelihood, best, box))
-
-        return self._refitted(steps, chosen, near, fitted)
-
-    def _lifted(
-        self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]
-    ) -> list[Step]:
-        """Fit the chosen steps at all heights, so that the rings fit too."""
-        z_range = self._context.config.fit.z_range_nm
-
-        def fitted(step: Step, task: Task) -> Step:
-            fit = fit_particle(
-                task.likelihood, task.displaced(step.start), self._context.mode, z_range,
-                level=True, correct_bias=False,
-            )  # fmt: skip
-            return self._moved(step, task, fit.theta, fit.snr) if fit.mass_kda > 0 else step
-
-        return self._refitted(steps, chosen, near, fitted)
+        fit = fit_particle(task.likelihood, start, mode, z_range, level=True, correct_bias=False)
+        return self._moved(step, task, fit.theta, fit.snr) if fit.mass_kda > 0 else step
 
     def _refitted(
         self,
+        fitted: Callable[[Step, Task], Step],
         steps: Sequence[Step],
         chosen: set[int],
         near: Sequence[Sequence[int]],
-        fitted: Callable[[Step, Task], Step],
     ) -> list[Step]:
+        """Fit the chosen steps, with the others fixed."""
+
         def one(index: int) -> Step:
             task = self._tasks.build(index, steps, near)
             return steps[index] if task is None else fitted(steps[index], task)

@@ -39,8 +39,6 @@ class Task:
     patch: Patch
     windows: Windows
     at: StepFrame
-    n_before: int
-    n_after: int
     crowded: bool
     offset_px: FloatArray
 
@@ -51,9 +49,10 @@ class Task:
 
     def event(self, fit: FitResult, likelihood: Likelihood, sign: int) -> Event:
         """Make an event of a fit."""
-        at, counts = self.at, (self.n_before, self.n_after)
+        at, windows = self.at, self.windows
+        n_before, n_after = (windows.n_before, windows.n_after)[::sign]  # in time
         return Event(
-            self.region, fit, likelihood, self.windows, (), at.frame, *counts, sign,
+            self.region, fit, likelihood, windows, (), at.frame, n_before, n_after, sign,
             at.half_width, at.rise,
         )  # fmt: skip
 
@@ -106,17 +105,16 @@ class TaskBuilder:
         span, crowded = self._span(step, close)
         gap = at.kept_out(self._window)
         begin, end = max(span[0], chunk.first), min(span[1], chunk.stop)
-        first = (begin, max(at.frame - gap, begin))
-        second = (min(at.frame + gap, end), end)
+        spans = (begin, max(at.frame - gap, begin)), (min(at.frame + gap, end), end)
         if begin < held.first or end > held.first + len(held.counts):
             held = chunk.patch(begin, end, region.rows, region.columns)
         patch = held.frames(begin, end)
-        sums = [patch.window(*frames) for frames in (first, second)]
-        (_, n_before, power_before), (_, n_after, power_after) = sums
-        if not n_before or not n_after:
+        # a particle that leaves is fitted as one that lands, the other way round in time
+        windows = patch.windows(*spans[:: step.sign])
+        if not windows.n_before or not windows.n_after:
             return None
-        cuts = chunk.cut(*first), chunk.cut(*second)
-        ratio = np.full(region.shape, power_after / power_before)
+        cuts = chunk.cut(*spans[0]), chunk.cut(*spans[1])
+        ratio = np.full(region.shape, windows.power_ratio**step.sign)
         for other in neighbours:
             self.neighbours.apply(ratio, other, *cuts, region)
         self.neighbours.interfere(ratio, step, neighbours, *cuts, region)
@@ -134,34 +132,18 @@ class TaskBuilder:
                 ratio[here] *= self.neighbours.own_factor(step, *cuts, inside)
             with_it = cuts[1] if step.sign > 0 else cuts[0]
             offset = moving.shift(with_it) - moving.at(at.frame)
-        # a particle that leaves is fitted as one that lands, the other way round in time
-        (before, n_without, light_without), (after, n_with, light_with) = sums[:: step.sign]
-        ranges = (first, second)[:: step.sign]
-        read = np.square(patch.read_noise_e, dtype=np.float64)  # one number for most cameras
-        variances = [np.broadcast_to(n * read, before.shape) for n in (n_without, n_with)]
-        windows = Windows(
-            before_e=before,
-            after_e=after,
-            n_before=n_without,
-            n_after=n_with,
-            power_ratio=light_with / light_without,
-            read_variance_before_e2=variances[0],
-            read_variance_after_e2=variances[1],
-            masked=~chunk.usable[region.slices],
-            saturated=chunk.saturated[region.slices],
-            frames_before=ranges[0],
-            frames_after=ranges[1],
-            power=np.empty(0),
-        )
         place = (step.start.x_px * context.pixel_nm, step.start.y_px * context.pixel_nm)
         likelihood = conditional(
-            context.model_at(*place, sum(ranges[1]) // 2),
+            context.model_at(*place, sum(windows.frames_after) // 2),
             PixelGrid.region(region.rows, region.columns, context.pixel_nm),
-            before, after, ratio if step.sign > 0 else 1 / ratio,
-            read_variances_e2=(variances[0], variances[1]), masked=windows.masked,
-        )  # fmt: skip
+            windows.before_e,
+            windows.after_e,
+            ratio**step.sign,
+            read_variances_e2=(windows.read_variance_before_e2, windows.read_variance_after_e2),
+            masked=windows.masked,
+        )
         likelihood = context.with_prior(likelihood, step.start.mass_kda)
-        return Task(likelihood, region, patch, windows, at, n_before, n_after, crowded, offset)
+        return Task(likelihood, region, patch, windows, at, crowded, offset)
 
     def trace_spans(
         self, step: Step, windows: Windows, others: Sequence[Step]
@@ -175,12 +157,12 @@ class TaskBuilder:
         limit_px = self._context.config.detection.min_separation_nm / pixel
         close = [s for s in others if distance_px(s, step) < limit_px]
         changes = {
-            id(s)
+            s
             for s in close
             if distance_px(s, step) * pixel < SAME_NM
             and 3 * s.start.mass_kda <= step.start.mass_kda
         }
-        own = tuple(s for s in others if id(s) not in changes)
+        own = tuple(s for s in others if s not in changes)
         without, there = windows.frames_before, windows.frames_after
         # signal-to-noise ratio of a frame below which no more than a window tells
         if step.at.per_frame_snr < 2.0:
@@ -189,10 +171,8 @@ class TaskBuilder:
         reaches = (reach, max(reach, TRACE_FRAMES))[:: step.sign]
         low = max(step.at.frame - reaches[0], self._chunk.first)
         high = min(step.at.frame + reaches[1], self._chunk.stop)
-        for other in close:
+        for other in (s for s in close if s not in changes):
             gap = other.at.kept_out(self._window)
-            if id(other) in changes:
-                continue
             if other.at.frame < step.at.frame:
                 low = max(low, other.at.frame + gap)
             else:

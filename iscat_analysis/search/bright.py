@@ -25,7 +25,8 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from iscat_analysis.records import BoolArray, FloatArray, Mapper
+from iscat_analysis.config import Config
+from iscat_analysis.records import BoolArray, FloatArray, Mapper, Windows
 from iscat_analysis.search.dating import locate_step
 from iscat_analysis.search.frames import Chunk
 from iscat_analysis.search.peaks import maxima
@@ -86,15 +87,7 @@ class BrightStep:
     snr: float
     rows: tuple[int, int]
     columns: tuple[int, int]
-    before_e: FloatArray
-    after_e: FloatArray
-    frames_before: tuple[int, int]
-    frames_after: tuple[int, int]
-    n_before: int
-    n_after: int
-    power_ratio: float
-    usable: BoolArray
-    read_variance_e2: FloatArray
+    windows: Windows
     motion: FloatArray | float = 1.0
 
 
@@ -119,20 +112,14 @@ class _Spot(NamedTuple):
 
 
 def find_bright_steps(
-    chunk: Chunk,
-    window: int,
-    *,
-    pixel_nm: float,
-    resolution_nm: float,
-    roi_px: int,
-    motion: Motion | None = None,
-    mapper: Mapper = map,
+    chunk: Chunk, window: int, config: Config, *, motion: Motion | None = None, mapper: Mapper = map
 ) -> BrightSteps:
     """Find the bright steps of a chunk, which are cut when they are asked for."""
+    pixel_nm = config.camera.pixel_size_nm or math.nan
     moved = None if motion is None else motion.contrast
-    # standard deviation of the spot over λ/NA
-    spots = _spots(chunk, 1.0 * resolution_nm / pixel_nm, _SHADOW_NM / pixel_nm, moved, mapper)
-    return BrightSteps(chunk, spots, window, pixel_nm, roi_px, motion)
+    spot_px = config.optics.wavelength_nm / config.optics.na / pixel_nm  # standard deviation
+    spots = _spots(chunk, spot_px, _SHADOW_NM / pixel_nm, moved, mapper)
+    return BrightSteps(chunk, spots, window, pixel_nm, config.fit.roi_px(pixel_nm), motion)
 
 
 def _spots(
@@ -295,15 +282,13 @@ class BrightSteps:
             ends = (low, frame - gap), (frame + gap, high)
             if min(last - start for start, last in ends) < LEAST_FRAMES:
                 return None
-            (before, after), counts, power = zip(*(patch.window(*end) for end in ends), strict=True)
-            if min(counts) < LEAST_FRAMES:
+            windows = patch.windows(*ends)
+            if min(windows.n_before, windows.n_after) < LEAST_FRAMES:
                 return None
             moved: FloatArray | float = 1.0
             if self.motion is not None:
                 moved = self.motion.between(rows, columns, *(chunk.cut(*end) for end in ends))
-            read = np.full(before.shape, np.square(patch.read_noise_e))
-            sums = before, after, *ends, *counts, power[1] / power[0], patch.usable, read, moved
-            step = BrightStep(frame, centre[1], centre[0], 0.0, rows, columns, *sums)
+            step = BrightStep(frame, centre[1], centre[0], 0.0, rows, columns, windows, moved)
             y_px, x_px, snr = centre_of_energy(*measured_contrast(step), self.pixel_nm)
             step = replace(step, y_px=y_px + first[0], x_px=x_px + first[1], snr=snr)
             centre = round(step.y_px), round(step.x_px)
@@ -330,8 +315,9 @@ def measured_contrast(step: BrightStep) -> tuple[FloatArray, FloatArray]:
 
     Shapes: `contrast, variance` (ny, nx).
     """
-    used = step.usable & (step.before_e > 0) & (step.after_e > 0)
-    before, after = np.where(used, step.before_e, 1.0), np.where(used, step.after_e, 1.0)
+    sums = step.windows.before_e, step.windows.after_e
+    used = ~step.windows.masked & (sums[0] > 0) & (sums[1] > 0)
+    before, after = (np.where(used, part, 1.0) for part in sums)
     expected = before * step.motion
     ratio = float(after[used].sum() / expected[used].sum())
     contrast = np.where(used, after / (ratio * expected) - 1, 0.0)

@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.sliding import block_sums, frame_totals
 from iscat_analysis.camera import Camera, find_defects
 from iscat_analysis.last_used import LastUsed
-from iscat_analysis.records import BoolArray, CountSource, FloatArray, InPlace, Mapper, PlacedSource
+from iscat_analysis.records import (
+    BoolArray,
+    CountSource,
+    FloatArray,
+    InPlace,
+    Mapper,
+    PlacedSource,
+    Windows,
+)
 
 Box = tuple[slice, slice]
 """Rows and columns."""
@@ -326,6 +334,7 @@ class Chunk(FieldSums):
             read_noise_e=_at(camera.read_noise_e, pixels),
             mean_e=self.mean_e[pixels],
             usable=self.usable[pixels],
+            saturated=self.saturated[pixels],
         )
 
     def electrons(self, frames: slice, box: Box) -> FloatArray:
@@ -370,6 +379,7 @@ class Patch:
     read_noise_e: float | FloatArray
     mean_e: FloatArray
     usable: BoolArray
+    saturated: BoolArray
 
     @property
     def pixels(self) -> NDArray[Any]:
@@ -392,6 +402,26 @@ class Patch:
         frames = int(np.count_nonzero(part.good))
         return self.gain * (out - frames * self.offset), frames, float(part.power.sum())
 
+    def windows(self, before: tuple[int, int], after: tuple[int, int]) -> Windows:
+        """Sum the frames before and after something; without light before, their ratio is 0."""
+        before_e, n_before, light = self.window(*before)
+        after_e, n_after, power = self.window(*after)
+        read = np.broadcast_to(np.square(self.read_noise_e, dtype=np.float64), before_e.shape)
+        return Windows(
+            before_e=before_e,
+            after_e=after_e,
+            n_before=n_before,
+            n_after=n_after,
+            power_ratio=power / light if light > 0 else 0.0,
+            read_variance_before_e2=n_before * read,
+            read_variance_after_e2=n_after * read,
+            masked=~self.usable,
+            saturated=self.saturated,
+            frames_before=before,
+            frames_after=after,
+            power=np.empty(0),
+        )
+
     def part(self, rows: slice, columns: slice) -> Patch:
         """Copy some of its pixels, which count from its own first one."""
         here = rows, columns
@@ -403,6 +433,7 @@ class Patch:
             read_noise_e=_at(self.read_noise_e, here),
             mean_e=self.mean_e[here],
             usable=self.usable[here],
+            saturated=self.saturated[here],
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import permutations
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,8 +70,8 @@ def measure_noise(
     strip = _Strip.of(counts, camera, adjacent=follows)
     lengths = sorted({*_LENGTHS[:-1], max(longest, 1)})
     lengths = [n for n in lengths if n <= longest and 2 * n <= len(counts)]
-    found = map(strip.compared, lengths)
-    return NoiseCurve(tuple(lengths), tuple(each.rest if follows else each.noise for each in found))
+    found = (strip.compared(length)[1 if follows else 0] for length in lengths)
+    return NoiseCurve(tuple(lengths), tuple(found))
 
 
 def measure_motion(counts: NDArray[Any], camera: Camera, length: int) -> float:
@@ -79,15 +79,7 @@ def measure_motion(counts: NDArray[Any], camera: Camera, length: int) -> float:
 
     Shapes: `counts` (t, y, x).
     """
-    return _Strip.of(counts, camera, adjacent=True).compared(length).motion
-
-
-class _Compared(NamedTuple):
-    """Variances of the difference of neighbouring averages, over that of shot noise."""
-
-    noise: float  # of the contrast
-    rest: float  # the same without motion
-    motion: float  # by least squares, which knows it better than their difference
+    return _Strip.of(counts, camera, adjacent=True).compared(length)[2]
 
 
 @dataclass(frozen=True)
@@ -114,8 +106,12 @@ class _Strip:
         )
         return cls(counts[:, rows], gain, offset, camera.read_variance_e2(shape)[rows], adjacent)
 
-    def compared(self, n: int) -> _Compared:
-        """Compare averages of n frames; motion can be measured in adjacent rows only."""
+    def compared(self, n: int) -> tuple[float, float, float]:
+        """Variances of the difference of neighbouring averages of n frames, over shot noise.
+
+        That of the contrast, the same without motion, and that of motion by least squares, which
+        know it better than their difference; motion can be measured in adjacent rows only.
+        """
         blocks = 2 * min(len(self.counts) // (2 * n), 8)
         parts = self.counts[: blocks * n].reshape(blocks, n, *self.counts.shape[1:])
         sums = self.gain * (parts.sum(axis=1, dtype=np.float64) - n * self.offset)
@@ -128,7 +124,7 @@ class _Strip:
         change = (contrast / sigma)[:, lit]
         noise = robust_sigma(change) ** 2
         if not self.adjacent:
-            return _Compared(noise, math.nan, math.nan)
+            return noise, math.nan, math.nan
         light = before + after
         # pixels, whose differences make up the slope of a fine pattern
         steps = ((reach, axis) for axis in (1, 2) for reach in (1, 2, 3, 4))
@@ -140,7 +136,7 @@ class _Strip:
         moved = np.linalg.pinv(turned @ seen, hermitian=True) @ (turned @ change[..., None])
         motion = _shared_motion(change, seen, turned, np.nonzero(lit)[1])
         motion /= max(int(np.count_nonzero(usual)), 1)
-        return _Compared(noise, robust_sigma(change - (seen @ moved)[..., 0]) ** 2, motion)
+        return noise, robust_sigma(change - (seen @ moved)[..., 0]) ** 2, motion
 
 
 def _shared_motion(

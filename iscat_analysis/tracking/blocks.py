@@ -111,7 +111,7 @@ class Aligned:
             mass_kda=float(context.model.scale.mass(theta[3])),
             snr=float(np.sqrt(np.sum(signal**2 * likelihood.signal_information(signal)))),
             owner=int(self.track[number]),
-            heights_nm=fit.z_range_nm if fit.mode == "joint" else None,
+            heights_nm=fit.z_range_nm if fit.heights_free else None,
         )
 
 
@@ -128,8 +128,7 @@ def align(context: AnalysisContext, moving: TrackedRows) -> Aligned:
         good &= np.isfinite(moving.common.amplitude)[rows.track]
     chosen = np.flatnonzero(_brightest(rows.track, rows.snr, good))
     if not len(chosen):
-        empty, nothing = np.zeros((0, side, side)), np.zeros(0, dtype=np.int64)
-        return Aligned(nothing, empty, empty, empty, np.zeros((0, 5)), nothing)
+        return NO_PICTURES
     if heights_free:  # 36 from all heights alike: each has a height that is searched
         ranked = chosen[np.argsort(rows.theta[chosen, 2], kind="stable")]
         some = np.linspace(0, len(ranked) - 1, min(36, len(ranked))).round().astype(int)
@@ -172,6 +171,10 @@ def _brightest(track: IntArray, snr: FloatArray, good: BoolArray) -> BoolArray:
     return np.asarray(good & np.isin(track, best[enough[best]]))
 
 
+_NOTHING, _EMPTY = np.zeros(0, dtype=np.int64), np.zeros((0, 1, 1))
+NO_PICTURES = Aligned(_NOTHING, _EMPTY, _EMPTY, _EMPTY, np.zeros((0, 5)), _NOTHING)
+
+
 @dataclass(frozen=True)
 class Block:
     """The results of a block of frames."""
@@ -188,7 +191,7 @@ class Block:
 
     noise: tuple[Finding, ...] = ()
     noise_differs: bool = False
-    aligned: Aligned | None = None
+    aligned: Aligned = NO_PICTURES
 
     @property
     def level_e(self) -> float:
@@ -226,7 +229,7 @@ def analyse_block(
     table, inside = moving_table(context, moving, first), field.holds(rows.theta)
     masses = common_masses(context, moving)
     best = table.loc[table[inside].groupby("track")["snr"].idxmax()]
-    aligned, noise = None, Noise()
+    aligned, noise = NO_PICTURES, Noise()
     if not goes_on[0]:
         aligned = pictures.result()
         noise = judged.result().compared_with_fits(table["chi2_reduced"].to_numpy(float))

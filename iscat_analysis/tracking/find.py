@@ -90,7 +90,7 @@ def held_height_warning(
     config: Config, recording: Recording, span: tuple[int, int], fits: pd.DataFrame
 ) -> Finding | None:
     """Find whether particles seem to stay at one height, where fits with free heights fail."""
-    if config.track.free != "joint" or not len(fits):
+    if not config.track.heights_free or not len(fits):
         return None
     first, last = span[0], min(span[1], span[0] + 200)
     free = _rejected(fits[fits["frame"].between(first, last - 1)])
@@ -154,7 +154,7 @@ _STEPS = 100  # of the progress of a block
 def find_moving(ready: Prepared, run: Run) -> DetectionResult:
     """Track particles over backgrounds that are learnt with them."""
     config, camera = ready.config, ready.camera
-    additive = config.optics.scheme == "darkfield"
+    additive = not config.optics.interferes
     kept = keep_frames(ready.steady, camera, fitted_frames(ready.steady, config), additive=additive)
     movie, (first, last) = kept.movie, kept.span
     run.report(kept.finding)
@@ -254,7 +254,7 @@ def _find_in_dark_field(
     )
     run.clock.lap("background")
     context = sharp = tracking_context(config, ready.shape, frames, ready.lines)
-    variance_nm2, upwards = 0.0, config.track.free == "joint"
+    variance_nm2, upwards = 0.0, config.track.heights_free
     last: FloatArray | None = None
     for turn in range(12):
         told = Findings()  # only the last turn has the background

@@ -406,7 +406,7 @@ def load_field(
         context.wide,
         pixel_nm=context.pixel_nm,
         roi_px=context.roi_px,
-        z_range_nm=context.config.fit.z_range_nm if context.mode == "joint" else None,
+        z_range_nm=context.config.fit.z_range_nm if context.config.fit.heights_free else None,
         pool=recording.pool,
         saturated=saturated,
     )

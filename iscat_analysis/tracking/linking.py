@@ -232,7 +232,7 @@ def with_mass(config: Config, rows: Localizations, error: float) -> FloatArray:
 
 def mass_error(config: Config, rows: Localizations, error: float) -> float:
     """Give the error of the mass that linking assumes between frames."""
-    if config.track.free == "joint" and len(rows.frame):
+    if config.track.heights_free and len(rows.frame):
         return max(error, 0.25 * float(np.median(rows.theta[:, 3])))  # of the mass
     return error
 

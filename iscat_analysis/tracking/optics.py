@@ -204,8 +204,7 @@ class Tracks:
                 return None
             near = settings_of(self.begun.config) if self.described else None
         aligned, context = self.begun.block.aligned, self.begun.context
-        shown = [] if aligned is None else _brightest(aligned, MOST_IMAGES)
-        images = [aligned.particle_image(context, n) for n in shown] if aligned is not None else []
+        images = [aligned.particle_image(context, n) for n in _brightest(aligned, MOST_IMAGES)]
         return Collected(self.start, images, near=near, found_with=self.begun.config)
 
     def describes(self, seen: Collected) -> bool:
@@ -230,10 +229,10 @@ def mass_error(summary: Mapping[str, Any]) -> float:
 def _misfit(block: Block, context: AnalysisContext) -> Misfit | None:
     """Sum the misfit over all pictures; None where there are none."""
     aligned = block.aligned
-    if aligned is None or not len(aligned.track):
+    if not len(aligned.track):
         return None
     tracks = len(np.unique(aligned.track))
-    if context.mode == "joint":
+    if context.config.fit.heights_free:
         return _misfit_of_single_pictures(aligned, context, tracks)
     rest, signal, variance = (np.zeros(aligned.light_e.shape[1:]) for _ in range(3))
     for number, theta in enumerate(aligned.theta):
@@ -272,7 +271,7 @@ def _share(excess: float, power: float) -> float:
 
 def _free(context: AnalysisContext) -> BoolArray:
     """Tell which parameters of a picture are fitted, as `Likelihood` has it."""
-    return np.array([True, True, context.mode == "joint", True, False])
+    return np.array([True, True, context.config.fit.heights_free, True, False])
 
 
 def _brightest(aligned: Aligned, most: int) -> list[int]:
@@ -285,8 +284,6 @@ def _brightest(aligned: Aligned, most: int) -> list[int]:
 def _cause(begun: TrialTracks) -> Cause | None:
     """Name the part of the microscope whose change resembles the misfit most."""
     aligned, context = begun.block.aligned, begun.context
-    if aligned is None:
-        return None
     shown = _brightest(aligned, 24)
     fits = [(aligned.likelihood(context, n), aligned.theta[n], _free(context)) for n in shown]
     return likely_cause(context.config, fits)

@@ -172,7 +172,7 @@ def search_frames(
 ) -> Localizations:
     """Find candidates in the residual of the rows so far."""
     side = context.roi_px
-    if context.mode == "joint":
+    if context.config.fit.heights_free:
         side += round(2 * RING_SLOPE * context.config.fit.z_range_nm[1] / field.pixel_nm)
     sign, light = context.config.detection.sign, (ground.level, field.read_e2, field.used)
     search = FrameFilter(context.templates, *light, polarity=sign, roi_px=side, cautious=cautious)

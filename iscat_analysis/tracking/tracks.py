@@ -297,7 +297,7 @@ def track_setup(context: AnalysisContext, windows: Windows) -> TrackSetup:
         field_nm=((rows - 1) * context.pixel_nm, (columns - 1) * context.pixel_nm),
         near_nm=config.detection.min_separation_nm,
         min_frames=config.track.min_frames,
-        volume=config.track.free == "joint",
+        volume=config.track.heights_free,
         viscosity_mpa_s=config.track.viscosity_mpa_s,
         temperature_c=config.track.temperature_c,
         index=None
@@ -321,7 +321,7 @@ def mass_correlation(context: AnalysisContext, fits: pd.DataFrame) -> Correlatio
     config = context.config
     before = fits["n_before"].median() if len(fits) else 0
     learnt = background_mode(config) == "tracks"
-    known = config.background.method == "known" or context.additive != learnt
+    known = config.background.is_known or learnt != context.additive
     if known or not before > 0:
         return None
     share = context.background_variance / (context.background_variance + before)
@@ -461,7 +461,7 @@ def _models(context: AnalysisContext, tracks: pd.DataFrame) -> dict[int, Forward
     if background_mode(context.config) != "tracks" and not context.model.is_sized:
         known[:] = 0.0
     _, exposure_s = exposure_of(context.config)
-    upwards = context.config.track.free == "joint"
+    upwards = context.config.track.heights_free
     return {
         int(track): blurred(context.wide, path_variance_nm2(d, exposure_s), upwards=upwards)
         for track, d in zip(tracks["track"], known, strict=True)

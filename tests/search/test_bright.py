@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from iscat_analysis.camera import Camera
+from iscat_analysis.config import load_config
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.bright import BrightStep, excess_of, find_bright_steps
 from iscat_analysis.search.frames import Chunk, make_chunk, measure_frames
@@ -31,9 +32,11 @@ def _steps(events: list[tuple[int, float, float, float]], seed: int) -> list[Bri
     for frame, y, x, contrast in events:
         expected[frame:] *= 1 + _ring(y, x, contrast)
     counts = random.poisson(expected).astype(np.uint16)
-    steps = find_bright_steps(
-        _chunk(counts), WINDOW, pixel_nm=PIXEL_NM, resolution_nm=370.0, roi_px=20
-    )
+    settings = [
+        f"camera.pixel_size_nm={PIXEL_NM}", f"fit.roi_nm={20 * PIXEL_NM}",
+        "optics.wavelength_nm=444", "optics.na=1.2",
+    ]  # fmt: skip
+    steps = find_bright_steps(_chunk(counts), WINDOW, load_config(None, settings))
     return steps.alone(20)
 
 
@@ -52,7 +55,7 @@ def test_steps_are_found_at_their_place_and_frame() -> None:
         assert abs(step.frame - frame) <= 1
         assert step.y_px == pytest.approx(y, abs=0.5)
         assert step.x_px == pytest.approx(x, abs=0.5)
-        contrast = step.after_e / (step.power_ratio * step.before_e) - 1
+        contrast = step.windows.after_e / (step.windows.power_ratio * step.windows.before_e) - 1
         truth = _ring(y, x, {e[0]: e[3] for e in events}[frame])
         cut = truth[slice(*step.rows), slice(*step.columns)]
         assert np.corrcoef(contrast.ravel(), cut.ravel())[0, 1] > 0.8

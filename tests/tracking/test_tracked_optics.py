@@ -23,6 +23,7 @@ from iscat_analysis.instrument.loop import Round, Rounds
 from iscat_analysis.instrument.particle_image import Collected
 from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.optics.parameters import settings_of, with_settings
+from iscat_analysis.tracking.blocks import NO_PICTURES
 from iscat_analysis.tracking.optics import (
     MASS_SHARE,
     REJECTED_SHARE,
@@ -212,10 +213,9 @@ def test_rounds_end_where_the_first_four_describe_nothing(
     def begin(config: Config, **_: bool) -> Any:
         described = described_from is not None and len(seen) % rounds >= described_from
         left = Misfit(share=0.0 if described else 0.2, clear=True, tracks=3)
-        block = SimpleNamespace(noise_differs=False, aligned=None)
-        return SimpleNamespace(
-            config=config, block=block, left=left, described=described, context=None
-        )
+        block = SimpleNamespace(noise_differs=False, aligned=NO_PICTURES)
+        own = {"context": SimpleNamespace(config=config), "described": described}
+        return SimpleNamespace(config=config, block=block, left=left, **own)
 
     def fit(*_: Any, **__: Any) -> Any:
         seen.append(-300.0 + 50 * len(seen))
