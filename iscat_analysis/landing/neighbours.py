@@ -135,26 +135,13 @@ class Neighbours:
         """Make a step of a sphere, whose contrast is drawn where it is."""
         pixel = self.context.pixel_nm
         start = Candidate(fit.x_nm / pixel, fit.y_nm / pixel, fit.z_nm, fit.mass_kda, fit.snr)
-        drawn = self.draw(
-            sign, at, start, theta=fit.theta, snr=fit.snr, excess=excess, sphere=sphere
-        )
-        return replace(drawn, sphere=(sphere, fit))
+        drawn = self.draw(sign, at, start, sphere)
+        return replace(drawn, theta=fit.theta, snr=fit.snr, excess=excess, sphere=(sphere, fit))
 
     def draw(
-        self,
-        sign: int,
-        at: StepFrame,
-        start: Candidate,
-        *,
-        theta: FloatArray | None = None,
-        snr: float = math.inf,
-        excess: float = 0.0,
-        sphere: SeatedModel | None = None,
+        self, sign: int, at: StepFrame, start: Candidate, sphere: SeatedModel | None = None
     ) -> Step:
-        """Make a step, whose contrast is drawn where it is.
-
-        Shapes: `theta` (5,).
-        """
+        """Make a step, whose contrast is drawn where it is."""
         context, half = self.context, self._half(start)
         sides = []
         for centre, size in zip((start.y_px, start.x_px), self.chunk.shape, strict=True):
@@ -172,7 +159,7 @@ class Neighbours:
             return model.image(grid, *place, start.z_nm, start.mass_kda)
 
         drawn = Drawn(sides[0], sides[1], image, self._images)
-        return Step(sign, at, start, drawn, theta, snr, excess)
+        return Step(sign, at, start, drawn)
 
     def _half(self, start: Candidate) -> int:
         """From the centre to the edge of a step's image [pixels].

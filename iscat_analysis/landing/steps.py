@@ -281,11 +281,11 @@ class ChunkFitter:
             z_nm=float(theta[2]),
             mass_kda=float(likelihood.model.scale.mass(theta[3])),
         )
+        if step.is_measured:
+            return replace(step, at=task.at, start=start, theta=theta, snr=snr)
         excess = chi2_excess(likelihood.residuals(theta))
-        moved = self.neighbours.draw(step.sign, task.at, start, theta=theta, snr=snr, excess=excess)
-        if not step.is_measured:
-            return moved
-        return replace(step, at=moved.at, start=moved.start, theta=theta, snr=snr)
+        moved = self.neighbours.draw(step.sign, task.at, start)
+        return replace(moved, theta=theta, snr=snr, excess=excess)
 
     @property
     def _quick_mode(self) -> str:

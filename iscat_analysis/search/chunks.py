@@ -66,14 +66,14 @@ class Reader:
         self.first, self.last = first, last
         self.shape = (movie.shape[1], movie.shape[2])
         self.frame_bytes = math.prod(self.shape) * movie.dtype.itemsize
-        self._placed = frames_in_place(movie, first, last)
+        self.placed = frames_in_place(movie, first, last)
         # made at once, because growing copies; only what is written to takes memory
         room = min(max(last - first, 0), room_bytes // self.frame_bytes)
-        if len(self._placed) > 1 and room == last - first:  # of several files, that all fit
-            self._placed = []
-        if self._placed:
+        if len(self.placed) > 1 and room == last - first:  # of several files, that all fit
+            self.placed = []
+        if self.placed:
             room = 0
-            self._lying = StoredFrames([run.counts for run in self._placed])
+            self._lying = StoredFrames([run.counts for run in self.placed])
         self._buffer = np.empty((room, *self.shape), dtype=movie.dtype)
         self._room_bytes = room_bytes
         self._scratch: Scratch | None = None  # frames that do not fit into memory
@@ -83,17 +83,12 @@ class Reader:
         self._summed: tuple[tuple[int, int], int, Chunk] | None = None  # span, stride, and that
 
     @property
-    def in_place(self) -> bool:
-        """Whether frames stay where they lie in the file."""
-        return bool(self._placed)
-
-    @property
     def held_bytes(self) -> int:
         """What a frame of a chunk counts for: half where it stays in one file.
 
         The system can take such pages back, but would have to read them again.
         """
-        return self.frame_bytes // 2 if len(self._placed) == 1 else self.frame_bytes
+        return self.frame_bytes // 2 if len(self.placed) == 1 else self.frame_bytes
 
     @cached_property
     def sampled(self) -> Reader:
@@ -127,19 +122,19 @@ class Reader:
 
     def _let_go(self) -> None:
         """Give back the memory of frames that lie in files."""
-        for run in self._placed:
+        for run in self.placed:
             run.let_go()
         if self._scratch is not None:
             self._scratch.let_go()
 
     def _check(self) -> None:
         """Refuse files that have become shorter."""
-        for run in self._placed:
+        for run in self.placed:
             run.check()
 
     def _keep(self, kept: slice, room: int) -> None:
         """Leave only some of the frames, with room for more behind them."""
-        if self._placed:
+        if self.placed:
             self._let_go()
             return
         frames, old = self._buffer[kept], self._buffer
@@ -170,7 +165,7 @@ class Reader:
 
     def _stored(self, start: int, stop: int, box: Box = EVERYWHERE) -> StoredFrames:
         """Frames [start, stop) of those that are held, where they lie."""
-        if self._placed:
+        if self.placed:
             self._check()
             return self._lying.views(start - self.first, stop - self.first, box)
         first = self._held[0]
@@ -216,7 +211,7 @@ class Reader:
                 frames = self._frames(low, high)
                 check_counts(frames, low, self.name, camera=self.camera)
 
-        if not self._placed:
+        if not self.placed:
             list(mapper(read, pieces))
         ahead = 1 if begin > start else 0  # the first new frame is compared with the last old one
         part = self._frames(begin - ahead, end)
@@ -268,7 +263,7 @@ class Reader:
         self, sums: FieldSums, tile: Tile, stride: int, pool: ThreadPoolExecutor
     ) -> Chunk:
         """Frames of one tile, summed in blocks."""
-        if not self._placed:
+        if not self.placed:
             self._hold(*sums.span, pool.map)
         counts, camera = self._stored(*sums.span, tile.here), self.camera.part(tile.here)
         part = sums.span[0], counts, sums.good, sums.power, camera
@@ -459,7 +454,7 @@ def sum_first_chunk(reader: Reader, config: Config, window: int) -> None:
     Frames that have to be read into memory are left for then: whoever looks at them divided by the
     flicker of their light needs as much room again.
     """
-    if not reader.in_place:
+    if not reader.placed:
         return
     first, *_ = plan_parts(reader, config, window)[0]
     if first.tile is None:

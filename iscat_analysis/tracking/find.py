@@ -23,8 +23,8 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import compress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -52,7 +52,6 @@ from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.optics.model import PATH_SPREAD, blurred, path_variance_nm2
 from iscat_analysis.records import (
     BoolArray,
-    EventView,
     FloatArray,
     Progress,
     Status,
@@ -172,9 +171,7 @@ def _find_in_blocks(
     """Track particles that dim or brighten backgrounds, which are learnt block by block."""
     config, movie, camera = ready.config, recording.movie, recording.camera
     jitter_future = start_in_thread(pattern_jitter_warning, movie, camera, span)
-    plan = plan_blocks(
-        movie, config, camera, check=recording.check, span=span, mapper=recording.pool.map
-    )
+    plan = plan_blocks(recording, config, span)
     jitter = jitter_future.result()
     run.report(plan.finding(movie.name), jitter and replace(jitter, where=movie.name))
     run.clock.lap("background")
@@ -335,7 +332,7 @@ def track_frames(
 ) -> DetectionResult:
     """Fit each frame after the background, starting from the frame before, and link."""
     movie, camera, (first, last) = recording.movie, recording.camera, windows.frames_after
-    found: list[tuple[Event, dict[str, Any], EventView]] = []
+    found: list[Event] = []
     repeats: list[FloatArray] = []
     noise: FrameNoise | None = None
     events: tuple[Event, ...] = ()
@@ -361,34 +358,30 @@ def track_frames(
                 noise = FrameNoise(context, windows, read, [event.fit for event in events])
             if events and noise is not None:
                 repeats += [noise.look(here, events)] * len(events)
-            views = [view_of(number, event) for number, event in enumerate(events)]
-            found += zip(events, lines_of(context, events), views, strict=True)
+            found += events
             recording.progress("track", frame + 1 - first, last - first)
     except KeyboardInterrupt:
         interrupted = True
     track = context.config.track
-    places = np.array([(line["x_nm"], line["y_nm"]) for _, line, _ in found]).reshape(-1, 2)
-    frames = np.array([line["frame"] for _, line, _ in found], dtype=np.int64)
+    places = np.array([event.place[:2] for event in found]).reshape(-1, 2)
+    frames = np.array([event.frame for event in found], dtype=np.int64)
     numbers = link(frames, places, reach_nm=track.max_step_nm, memory=track.memory_frames)
     order = np.lexsort((frames, numbers))
     own, found = numbers[order], [found[k] for k in order]
-    masses: pd.DataFrame | None = None
     tracked: dict[int, SphereTrack] = {}
-    if context.model.is_sized:  # all frames of a track tell its diameter together
+    sized = context.model.is_sized
+    if sized:  # all frames of a track tell its diameter together
         for number in np.unique(own).tolist():
-            mine = [event for (event, *_), k in zip(found, own, strict=True) if k == number]
+            mine = list(compress(found, own == number))
             tracked[number] = sphere_track(context, mine, recording.pool)
-        again = [event for one in tracked.values() for event in one.events]
-        views = [view_of(0, event) for event in again]
-        found = list(zip(again, lines_of(context, again), views, strict=True))
-    fits = make_rows([line for _, line, _ in found], {"event": own, "track": own})
-    if context.model.is_sized:
-        masses = table_of_sizes(tracked, mass_correlation(context, fits))
+        found = [event for one in tracked.values() for event in one.events]
+    fits = make_rows(lines_of(context, found), {"event": own, "track": own})
+    masses = table_of_sizes(tracked, mass_correlation(context, fits)) if sized else None
     firsts = np.unique(own, return_index=True)[1].tolist()
     return DetectionResult(
         context=context,
         fits=fits,
-        views=tuple(replace(found[k][2], event=int(own[k])) for k in firsts),
+        views=tuple(view_of(int(own[k]), found[k]) for k in firsts),
         image=contrast_image(context, windows),
         compared=Compared.of(windows),
         summary={},

@@ -49,16 +49,7 @@ from iscat_analysis.findings.tracks import BLOCKS_FOLLOW_DRIFT, TRACKED_FRAMES_L
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.movie import SelectedFrames, Stack
-from iscat_analysis.records import (
-    BoolArray,
-    CountSource,
-    FloatArray,
-    FrameSource,
-    IntArray,
-    Mapper,
-    Progress,
-    Windows,
-)
+from iscat_analysis.records import BoolArray, CountSource, FloatArray, IntArray, Progress, Windows
 from iscat_analysis.search.frames import DARK, measure_frames, well_lit
 from iscat_analysis.tracking.field import Exposures, MovingField
 from iscat_analysis.tracking.joint import first_background
@@ -78,6 +69,17 @@ than a pixel does: it stays at a place for many frames and makes the same error 
 while the errors that a steady drift makes before and after the middle of a block cancel."""
 
 _READ = 64  # frames read at a time
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A movie that is followed, its camera, a check of frames that are read, and threads."""
+
+    movie: CountSource
+    camera: Camera
+    check: Check
+    pool: ThreadPoolExecutor
+    progress: Progress
 
 
 @dataclass(frozen=True)
@@ -120,17 +122,9 @@ class Plan:
         return BLOCKS_FOLLOW_DRIFT(values | blocks | {"rest": rest}, where=name)
 
 
-def plan_blocks(
-    movie: FrameSource,
-    config: Config,
-    camera: Camera,
-    *,
-    check: Check,
-    span: tuple[int, int],
-    mapper: Mapper = map,
-) -> Plan:
+def plan_blocks(recording: Recording, config: Config, span: tuple[int, int]) -> Plan:
     """Divide a movie into blocks of frames that have a background each."""
-    first, last = span
+    movie, (first, last) = recording.movie, span
     frames, pixels = last - first, movie.shape[1] * movie.shape[2]
     memory_mb, given = config.compute.memory_limit_mb, config.track.block_frames
     room = int(memory_mb * 1e6) // (BYTES * pixels)
@@ -146,7 +140,7 @@ def plan_blocks(
     motion = None
     # a pattern is followed in fields of 32 pixels and more
     if given == "auto" and frames >= 2 * SHORTEST and min(movie.shape[1:]) >= 32:
-        motion, stiffness = follow_light(movie, camera, span, config, check=check, mapper=mapper)
+        motion, stiffness = follow_light(recording, config, span)
     if motion is None:
         return Plan(_spans(first, last, count))
     shift = motion.at(np.arange(first, last, dtype=float))
@@ -178,19 +172,13 @@ def drift_over_counting(
 
 
 def follow_light(
-    movie: FrameSource,
-    camera: Camera,
-    span: tuple[int, int],
-    config: Config,
-    *,
-    check: Check,
-    mapper: Mapper = map,
+    recording: Recording, config: Config, span: tuple[int, int]
 ) -> tuple[Trajectory | None, FloatArray]:
     """Measure how the fixed pattern moves through a movie, and its stiffness per squared pixel.
 
     Shapes: `stiffness` (2, 2).
     """
-    first, last = span
+    movie, camera, (first, last) = recording.movie, recording.camera, span
     shape = (movie.shape[1], movie.shape[2])
     # the sums between which the pattern is followed take a quarter of the memory
     most = int(0.25 * config.compute.memory_limit_mb * 1e6 / (8 * math.prod(shape)))
@@ -202,11 +190,11 @@ def follow_light(
     def add_up(part: int) -> None:
         for start in range(*spans[part], _READ):
             raw = movie.read(start, min(start + _READ, spans[part][1]))
-            check(raw, start)
+            recording.check(raw, start)
             full[part] |= camera.saturated(raw).any(axis=0)
             sums[part] += len(raw) * camera.to_electrons(raw.mean(axis=0))
 
-    list(mapper(add_up, range(count)))
+    list(recording.pool.map(add_up, range(count)))
     read = np.broadcast_to(camera.read_variance_e2(shape), shape)
     usable = ~(full.any(axis=0) | find_defects(sums.sum(axis=0), (last - first) * read))
     light = sums[:, usable].mean(axis=1) if usable.any() else np.zeros(count)
@@ -215,7 +203,7 @@ def follow_light(
         return None, np.zeros((2, 2))
     power = light * lengths.sum() / light.sum()
     middle = np.array([(low + high - 1) / 2 for low, high in spans])
-    motion = follow_pattern(sums, power, middle, usable, read, mapper=mapper)
+    motion = follow_pattern(sums, power, middle, usable, read, mapper=recording.pool.map)
     inside = trusted(usable)
     if motion is None or not inside.any() or not np.isfinite(motion.shift_px).all():
         return None, np.zeros((2, 2))
@@ -354,17 +342,6 @@ def initial_background(config: Config, field: MovingField) -> BackgroundEstimate
     if config.background.method == "fixed":
         ground = replace(ground, level=np.maximum(field.total_e / ground.power.sum(), 1e-3))
     return ground
-
-
-@dataclass(frozen=True)
-class Recording:
-    """A movie that is followed, its camera, a check of frames that are read, and threads."""
-
-    movie: CountSource
-    camera: Camera
-    check: Check
-    pool: ThreadPoolExecutor
-    progress: Progress
 
 
 def load_field(

@@ -31,6 +31,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
+from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,20 +70,6 @@ class _End(NamedTuple):
     direction: int
 
 
-class _Frames(dict[int, dict[int, FloatArray]]):
-    """Parameters of every particle by frame and track; an entry is made when it is asked for."""
-
-    def __init__(self, rows: Localizations, frames: int) -> None:
-        super().__init__()
-        self._rows, self._starts = rows, rows.starts(frames)
-
-    def __missing__(self, t: int) -> dict[int, FloatArray]:
-        here = slice(self._starts[t], self._starts[t + 1])
-        tracks, thetas = self._rows.track[here].tolist(), self._rows.theta[here]
-        self[t] = dict(zip(tracks, thetas, strict=True))
-        return self[t]
-
-
 def _apart(one: FloatArray, other: FloatArray) -> float:
     """Distance of two particles in the plane [nm]."""
     return math.hypot(*(one - other)[:2])
@@ -103,7 +90,9 @@ def extended(
     typical, blur = ended.theta[:, 3], ended.group
     ends = [_End(k, t, 1) for k, t in enumerate(ended.frame.tolist())]
     ends += [_End(k, t, -1) for k, t in enumerate(begun.frame.tolist())]
-    frames, refitted, added = _Frames(rows, field.frames), dict[int, Localizations](), 0
+    pairs = zip(rows.track.tolist(), rows.theta, strict=True)  # of frame after frame
+    frames = [dict(islice(pairs, n)) for n in np.diff(rows.starts(field.frames)).tolist()]
+    refitted, added = dict[int, Localizations](), 0
     meeting_nm, same_nm = _MEETING_RESOLUTIONS * resolution_nm, resolution_nm / 4
 
     def with_neighbours(t: int, new: dict[int, _End]) -> dict[int, FloatArray]:

@@ -347,9 +347,8 @@ def refine(task: Task, state: State) -> State:
 
 def _restored(task: Task, state: State) -> State:
     """Undo what was divided out with the particles, and choose the fringes of their rows."""
-    restore_particle_light(
-        task.context, task.recording, task.first, task.field, state.ground, state.rows
-    )
+    where = task.field, state.ground, state.rows
+    restore_particle_light(task.context, task.recording, task.first, *where)
     state = task.in_fringes(state)
     return replace(state, rows=without_outliers(state.rows))
 

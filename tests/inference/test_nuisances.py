@@ -409,10 +409,8 @@ def dated(
     image = -height * np.exp(-((x - 6) ** 2 + (y - 6) ** 2) / 8)
     background = 1e4 * rng.uniform(0.8, 1.2, image.shape)
     counts = rng.poisson(background * (1 + course[:, None, None] * image)).astype("u2")
-    every = np.ones(course.size)
-    patch = Patch(
-        0, counts, every > 0, every, 1.0, 0.0, 0.0, background, np.ones(image.shape, dtype=bool)
-    )
+    every, used = np.ones(course.size), np.ones(image.shape, dtype=bool)
+    patch = Patch(0, counts, every > 0, every, 1.0, 0.0, 0.0, background, used, ~used)
     return locate_step(patch, image, (50, 110), expected_rise=expected)
 
 

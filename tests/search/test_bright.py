@@ -70,13 +70,13 @@ def test_frames_of_a_neighbour_are_left_out() -> None:
     (step,) = [
         s for s in _steps([(80, 25.0, 22.0, 0.15), (94, 25.0, 37.0, 0.15)], 7) if s.frame < 85
     ]
-    assert step.n_after < 14
-    assert step.n_before >= WINDOW - 2
+    assert step.windows.n_after < 14
+    assert step.windows.n_before >= WINDOW - 2
 
 
 def test_one_place_that_changes_twice_is_dated_apart_or_left_out() -> None:
     steps = _steps([(90, 30.0, 30.0, 0.15), (97, 30.0, 30.0, 0.15)], seed=8)
-    assert all(step.n_before < WINDOW or step.n_after < WINDOW for step in steps)
+    assert all(step.windows.n_before < WINDOW or step.windows.n_after < WINDOW for step in steps)
 
 
 @pytest.mark.parametrize("side", [1, 2, 3])

@@ -294,7 +294,9 @@ def _inconstant(again: float, count: int = 400, level: float = 0.01) -> int:
     for _ in range(count):
         counts = rng.poisson(background * (1 + height[:, None, None] * image)).astype("u2")
         nothing = np.ones(image.shape, dtype=bool)
-        patch = Patch(0, counts, np.ones(60, bool), np.ones(60), 1.0, 0.0, 0.0, background, nothing)
+        patch = Patch(
+            0, counts, np.ones(60, bool), np.ones(60), 1.0, 0.0, 0.0, background, nothing, ~nothing
+        )
         few += locate_step(patch, image, (15, 46)).p_constant < level
     return few
 

@@ -108,7 +108,8 @@ def _plan(counts: np.ndarray, **sections: Any) -> Plan:
         config = config.model_copy(update={name: part})
     stack, camera = Stack(counts), Camera(gain_e_per_adu=GAIN)
     span = fitted_frames(stack, config)
-    return plan_blocks(stack, config, camera, check=_unchecked, span=span)
+    with threads(1) as pool:
+        return plan_blocks(Recording(stack, camera, _unchecked, pool, silent), config, span)
 
 
 def test_a_block_ends_where_drift_costs_more_than_counting() -> None:
@@ -159,10 +160,10 @@ def test_cost_of_drift_is_that_of_single_pixels() -> None:
         for a, b in spans
     ]
     expected = sum(change) / inside.size
-    _, stiffness = follow_light(
-        Stack((counts / GAIN).astype(np.float32)), Camera(gain_e_per_adu=GAIN), (0, frames),
-        _config(), check=_unchecked,
-    )  # fmt: skip
+    stack, camera = Stack((counts / GAIN).astype(np.float32)), Camera(gain_e_per_adu=GAIN)
+    with threads(1) as pool:
+        recording = Recording(stack, camera, _unchecked, pool, silent)
+        _, stiffness = follow_light(recording, _config(), (0, frames))
     shift = np.column_stack([np.zeros(frames), 0.004 * np.arange(frames)])
     assert drift_over_counting(shift, stiffness, spans) == pytest.approx(expected, rel=0.1)
 
