@@ -35,7 +35,7 @@ from iscat_analysis.tracking.frames import (
     restore_particle_light,
     tracking_context,
 )
-from iscat_analysis.tracking.rows import BackgroundEstimate, Localizations
+from iscat_analysis.tracking.rows import NO_ROWS, BackgroundEstimate, Localizations
 from iscat_analysis.tracking.search import search_frames
 from iscat_analysis.tracking.stages import blurred_rows
 
@@ -107,15 +107,13 @@ class MovingSearch:
         start = min(frame - (frame - first) % window, last - window)
         span = start, start + window
         field, ground = self._background(span)
-        nothing = np.zeros(0, dtype=np.int64)
-        rows = Localizations.of(nothing, nothing, np.zeros((0, 5)))
         here, context = frame - start, self._context
         light = ground.level * ground.power[here]
-        image = field.residual(ground, rows, here, here + 1)[0] / light
+        image = field.residual(ground, NO_ROWS, here, here + 1)[0] / light
 
         def search(threshold: float) -> pd.DataFrame:
             lowered = with_threshold(context, threshold)
-            found = search_frames(lowered, field, ground, rows, (here, here + 1))
+            found = search_frames(lowered, field, ground, NO_ROWS, (here, here + 1))
             (x_nm, y_nm, z_nm, amplitude, _), pixel = found.theta.T, field.pixel_nm
             mass = np.asarray(context.model.scale.mass(amplitude))
             each = zip(x_nm / pixel, y_nm / pixel, found.snr, z_nm, mass, strict=True)

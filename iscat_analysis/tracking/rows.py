@@ -84,6 +84,10 @@ class Localizations:
         return np.asarray(tree.query_pairs(limit_nm, output_type="ndarray"), dtype=np.int64)
 
 
+NO_ROWS = Localizations.of(np.arange(0), np.arange(0), np.zeros((0, 5)))
+"""None at all, as before the first search."""
+
+
 def medians_of_tracks(track: IntArray, values: FloatArray) -> FloatArray:
     """Give every row the median of the values of its track.
 

@@ -62,7 +62,7 @@ from iscat_analysis.tracking.linking import (
     typical,
     typical_error,
 )
-from iscat_analysis.tracking.rows import BackgroundEstimate, Judged, Localizations
+from iscat_analysis.tracking.rows import NO_ROWS, BackgroundEstimate, Judged, Localizations
 from iscat_analysis.tracking.search import search_frames
 
 
@@ -368,10 +368,8 @@ def find_rows_and_background(
     """Find and fit every particle in every frame."""
     field, progress = load_field(context, recording, span), recording.progress
     task = Task(context, recording, span[0], field, inner, cautious)
-    nothing = np.zeros(0, dtype=np.int64)
-    rows = Localizations.of(nothing, nothing, np.zeros((0, 5)))
     ground = initial_background(context.config, field)
-    state = State(rows, ground, np.zeros(0, dtype=np.bool_), np.zeros(1), np.zeros((0, 2)))
+    state = State(NO_ROWS, ground, np.zeros(0, dtype=np.bool_), np.zeros(1), np.zeros((0, 2)))
     for number, stage in enumerate(STAGES):
         progress("track", number, len(STAGES) + 1)
         state = stage(task, state)
