@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
@@ -13,19 +13,15 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from iscat_analysis.answers import output
-from iscat_analysis.report import movie_page
-from iscat_analysis.report.style import Sketch
 
 PAGES = (
     output,
     *(
         importlib.import_module(f"iscat_analysis.report.{name}")
-        for name in ("batch", "benchmark", "bounds", "calibration", "movie_page")
+        for name in ("batch", "benchmark", "bounds", "calibration")
     ),
 )
 """Modules that publish figures."""
-
-_EMPTY = Figure()
 
 
 def sketch(
@@ -47,14 +43,7 @@ def sketch(
     return dict.fromkeys(names, Markup("<svg/>"))
 
 
-def undrawn(sketches: Iterable[Sketch]) -> Iterator[tuple[str, Figure]]:
-    """Take the place of `drawn`: one empty figure stands for all that the page of a fit has."""
-    for name, _ in sketches:
-        yield name, _EMPTY
-
-
 def sketch_figures(patch: pytest.MonkeyPatch, *, pause_s: float = 0.0) -> None:
     """Let every report be written without its figures, with a pause after each of their files."""
-    patch.setattr(movie_page, "drawn", undrawn)
     for module in PAGES:
         patch.setattr(module, "publish", partial(sketch, pause_s=pause_s))

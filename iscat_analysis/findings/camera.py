@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from iscat_analysis.findings.registry import caution, fault, note
+from iscat_analysis.findings.registry import Subject, makers
+
+note, caution, fault = makers(Subject.CAMERA)
 
 # ---- numbers of the camera -------------------------------------------------------------------
 
@@ -89,6 +91,7 @@ NOISE_CORRELATED = caution(
     "noise-correlated",
     "{what}: the search accounts for it, so that false alarms are as configured; the fits assume "
     "independent pixels, so that their σ are wrong",
+    subject=Subject.ERRORS,
 )
 WINDOWS_NOISY = caution(
     "windows-noisy",
@@ -96,6 +99,7 @@ WINDOWS_NOISY = caution(
     "or the laser (set background.drift_correction = true), or by the rings of many bright "
     "particles",
     "lower background.window_frames, which helps against all",
+    subject=Subject.ERRORS,
 )
 
 # ---- pixels and frames -----------------------------------------------------------------------
@@ -194,38 +198,44 @@ PARTICLES_LAND = fault(
     "its particles land or leave rather than move: of {changes} clear changes {percent:.0f} % stay "
     "as they are",
     'use fit.mode = "mass" without background.frames, whose windows follow landings',
+    subject=Subject.ERRORS,
 )
 PARTICLES_MOVE = fault(
     "particles-move",
     "its particles move rather than land: around {percent:.0f} % of {changes} clear changes the "
     "picture is another one every {block} frames, as of what goes from place to place",
     'use fit.mode = "track", which follows them',
+    subject=Subject.ERRORS,
 )
 BACKGROUND_WAY = note("background-way", "{text}")
 TEMPLATE_BOUNDS = caution(
     "template-bounds",
     'optics.psf = "measured": bounds are those of the template, and there is no quantum bound: a '
     "measured picture does not give the field",
+    subject=Subject.OPTICS,
 )
 
 # ---- what fits and masses show ---------------------------------------------------------------
 
-MODEL_MISFITS = fault("model-misfits", "{cause}")
+MODEL_MISFITS = fault("model-misfits", "{cause}", subject=Subject.OPTICS)
 LINE_AMBIGUOUS = caution(
     "line-ambiguous",
     "[calibration] does not tell the mass of {fits}, flagged at_bound: {why}",
     "measure it with lighter standards, or set calibration.offset = 0 if its error allows it",
+    subject=Subject.SCALE,
 )
 SCALE_REFUSED = fault(
     "scale-refused",
     "the scale of masses does not hold here: it belongs to {whose}, and {refusal}; all rows are "
     "flagged {flag}, their contrasts are right",
     "measure standards as this movie is recorded (iscat calibrate mass)",
+    subject=Subject.SCALE,
 )
 SCALE_CARRIED = caution(
     "scale-carried",
     "the scale of masses is carried over from {whose}: a particle has {carried:.4g} times the "
     "contrast that it has there{advice}",
+    subject=Subject.SCALE,
 )
 CONTRAST_NONLINEAR = caution(
     "contrast-nonlinear",
@@ -234,17 +244,20 @@ CONTRAST_NONLINEAR = caution(
     "its standards are light, makes the heaviest {percent:.2g} % too {way}; systematic_mass_kda "
     "has that",
     "calibrate with standards as heavy as these",
+    subject=Subject.SCALE,
 )
 PARTICLES_LARGE = caution(
     "particles-large",
     "{particles} of {of} {are} no dipole: fitted as spheres on the coverslip ({models}), flagged "
     "large, these have no mass and belong to no species{poor}",
+    subject=Subject.OPTICS,
 )
 SIGN_TURNED = caution(
     "sign-turned",
     "{turned} of {particles} have a negative mass, as particles that leave: they {change} the "
     "image, and by {by} particles that land {other} it; if these particles land, correct that "
     "sign, or optics.focus_nm",
+    subject=Subject.OPTICS,
 )
 LIGHT_OF_EVENTS_CHANGES = caution(
     "events-change",
@@ -252,6 +265,7 @@ LIGHT_OF_EVENTS_CHANGES = caution(
     "step, not from one frame to the next: particles that settle slowly, move on, bleach or blink; "
     "their masses are those of the mean change (sum frames before the analysis if they settle "
     "within a few, or lower background.window_frames if they change later)",
+    subject=Subject.ERRORS,
 )
 HEIGHT_FIXED = caution(
     "height-fixed",
@@ -259,6 +273,7 @@ HEIGHT_FIXED = caution(
     '{along_nm:.2g} nm along z, as on a membrane: set track.free = "mass" and particle.height_nm = '
     '{height_nm:.3g}; with track.free = "joint" pictures are blurred along z as well, and masses '
     "come out too large",
+    subject=Subject.OPTICS,
 )
 EXPOSURE_SMEARS = caution(
     "exposure-smears",
@@ -266,6 +281,7 @@ EXPOSURE_SMEARS = caution(
     "and {poor:.0%} of the fits are poor: along z that turns the phase by too much for one "
     "picture, and optics, gain and noise cannot be judged",
     "expose for less{than}",
+    subject=Subject.ERRORS,
 )
 RESIDUES = caution(
     "residues",
@@ -274,4 +290,5 @@ RESIDUES = caution(
     "the other",
     "find what moves, a window, a mirror or the coverslip, leave these frames out (fit.frames), or "
     "shorten background.window_frames",
+    subject=Subject.ERRORS,
 )

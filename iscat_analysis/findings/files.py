@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from iscat_analysis.findings.registry import caution, fault, note
+from iscat_analysis.findings.registry import Subject, makers
+
+note, caution, fault = makers(Subject.CAMERA)
 
 FILE_IMPLIES = caution("file-implies", "{text}", page="howto/tiff")
 METADATA_DISAGREES = caution(

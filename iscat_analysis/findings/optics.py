@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from iscat_analysis.findings.registry import caution
+from iscat_analysis.findings.registry import Subject, makers
+
+_, caution, _ = makers(Subject.OPTICS)
 
 UNEQUAL_HEIGHTS = caution(
     "unequal-heights",
@@ -40,12 +42,14 @@ FLUCTUATING_CONTRAST = caution(
     "contrasts fluctuate by {percent:.2g} ± {error_percent:.1g} % while particles are there, over "
     "some {frames:g} frames: masses have the error that remains in the mean over an event's "
     "frames, and sigma_mass_kda contains it",
+    subject=Subject.ERRORS,
 )
 
 SLOW_LANDINGS = caution(
     "slow-landings",
     "the light of {rising} of {rows} steps rises over some {frames} frames, which are left out of "
     "their fits{unseen}",
+    subject=Subject.ERRORS,
 )
 
 UNEVEN_REFERENCE = caution(
@@ -60,11 +64,13 @@ UNDERSTATED_SIGMA = caution(
     "understated-sigma",
     "σ is too small: the measured spread is {ratios} times the Cramér–Rao bound; {cause}",
     'fit.sigma = "measured" scales σ by it',
+    subject=Subject.ERRORS,
 )
 
 SCALED_SIGMA = caution(
     "scaled-sigma",
     "σ is scaled by the measured spread, {ratios} times the Cramér–Rao bound; {cause}",
+    subject=Subject.ERRORS,
 )
 
 LESS_NOISE = caution(
@@ -72,6 +78,7 @@ LESS_NOISE = caution(
     "the measured spread is {ratios} times the Cramér–Rao bound: there is less noise than the "
     "camera's numbers say",
     "look at camera.gain_e_per_adu and camera.read_noise_e",
+    subject=Subject.ERRORS,
 )
 
 WIDE_SPECIES = caution(
@@ -80,6 +87,7 @@ WIDE_SPECIES = caution(
     "{least_percent:.2g} %), where the budget has {explained_percent:.2g} %: its particles differ, "
     "in height, focus over the field, shape or mass, or the light does; no error of a single row "
     "has that",
+    subject=Subject.ERRORS,
 )
 
 OPTICS_LEARNED = caution(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
@@ -10,6 +11,9 @@ from string import Formatter
 from typing import Any
 
 Value = float | int | str
+
+_STOP = re.compile(r"[:;] |\. |, (?:and|as|which|so|because|where) ")
+_FEW_LETTERS = 12
 
 
 class Severity(StrEnum):
@@ -21,6 +25,19 @@ class Severity(StrEnum):
     """Numbers may be wrong by more than their errors, or some are missing."""
     FAULT = "fault"
     """Numbers are wrong unless the remedy is taken."""
+
+
+class Subject(StrEnum):
+    """What a finding is about: a reader asks whether to believe each of these."""
+
+    CAMERA = "camera"
+    """Camera, light, file and frames."""
+    OPTICS = "optics"
+    """Microscope, and whether the pictures are as it makes them."""
+    ERRORS = "errors"
+    """Errors of single particles, and whether the particles that remain are a fair sample."""
+    SCALE = "scale"
+    """What makes a mass or a diameter of a contrast."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +56,8 @@ class FindingKind:
         What the user can do, in the same way; empty where nothing is to be done.
     page : str
         Page of the manual that explains it, as ``"howto/focus"``.
+    subject : Subject
+        What it is about.
     """
 
     code: str
@@ -46,6 +65,7 @@ class FindingKind:
     sentence: str
     remedy: str = ""
     page: str = ""
+    subject: Subject = Subject.ERRORS
 
     @property
     def names(self) -> frozenset[str]:
@@ -72,17 +92,24 @@ KINDS: dict[str, FindingKind] = {}
 
 
 def define(
-    severity: Severity, code: str, sentence: str, remedy: str = "", page: str = ""
+    severity: Severity,
+    code: str,
+    sentence: str,
+    remedy: str = "",
+    page: str = "",
+    *,
+    subject: Subject,
 ) -> FindingKind:
     """Register a kind of finding; a code that is taken is refused at import."""
     if code in KINDS:
         raise ValueError(f"the finding {code!r} is defined twice")
-    KINDS[code] = FindingKind(code, severity, sentence, remedy, page)
+    KINDS[code] = FindingKind(code, severity, sentence, remedy, page, subject)
     return KINDS[code]
 
 
-note, caution, fault = (partial(define, severity) for severity in Severity)
-"""Register a kind of finding of this severity."""
+def makers(subject: Subject) -> Iterator[Callable[..., FindingKind]]:
+    """Give what registers kinds of note, caution and fault, about a subject unless they say so."""
+    return (partial(define, severity, subject=subject) for severity in Severity)
 
 
 @dataclass(frozen=True)
@@ -129,6 +156,14 @@ class Finding:
         return where + self.kind.sentence.format(**self.values) + remedy
 
     @property
+    def brief(self) -> tuple[str, str]:
+        """The sentence to its first stop after a few words; and the remedy, or else the rest."""
+        text = self.kind.sentence.format(**self.values)
+        stop = _STOP.search(text, _FEW_LETTERS)
+        first, rest = (text[: stop.start()], text[stop.end() :]) if stop else (text, "")
+        return capital(first.rstrip(".")), capital(self.remedy or rest)
+
+    @property
     def summary(self) -> dict[str, Any]:
         """Its entry in ``findings`` of ``summary.json``."""
         return {
@@ -162,6 +197,12 @@ class Findings:
         order = list(Severity)[::-1]
         ranked = sorted(self.made, key=lambda finding: order.index(finding.severity))
         return [finding.summary for finding in ranked]
+
+
+def capital(text: str) -> str:
+    """Begin a text with a capital letter, unless it begins with a key of the configuration."""
+    first = text.split(" ")[0]
+    return text if set('._`"') & set(first) else text[:1].upper() + text[1:]
 
 
 def unreported(finding: Finding) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from iscat_analysis.findings.registry import caution
+from iscat_analysis.findings.registry import Subject, makers
+
+_, caution, _ = makers(Subject.ERRORS)
 
 NOT_A_MASS = caution(
     "not-a-mass",
@@ -10,6 +12,7 @@ NOT_A_MASS = caution(
     "scale is not a mass. What was measured are contrasts",
     "`iscat calibrate mass` makes masses of them",
     "howto/calibration",
+    subject=Subject.SCALE,
 )
 
 MANY_FLAGGED = caution(
@@ -23,6 +26,7 @@ MODEL_REJECTED = caution(
     "would by chance. Errors of the model, such as a wrong focus, aperture or pixel size, are not "
     "in σ, and in the spread only as rings left over of other particles; they show in how far the "
     "species are wider than σ",
+    subject=Subject.OPTICS,
 )
 
 NOTHING_FOUND = caution(

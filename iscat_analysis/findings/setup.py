@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from iscat_analysis.findings.registry import caution, fault, note
+from iscat_analysis.findings.registry import Subject, makers
+
+note, caution, fault = makers(Subject.CAMERA)
 
 CONFIGURATION_MERGED = note(
     "configuration-merged",
@@ -21,12 +23,14 @@ OFFSET_LEFT_OUT = caution(
     "offset-left-out",
     "calibration.offset is left out, because it belongs to the configured optics: σ of the mass is "
     "that of a mass proportional to the field",
+    subject=Subject.SCALE,
 )
 AMBIGUOUS_FITS = caution(
     "ambiguous-fits",
     "mode {mode}: {ambiguous} of {trials} fits have the status {status} and are left out of bias "
     "and spread: several {several} describe the pixels about as well",
     "use more photons or frames (bounds.photons_per_pixel, bounds.n_after), or a narrower {key}",
+    subject=Subject.OPTICS,
 )
 
 SATURATED_PLAN = fault(
@@ -42,6 +46,7 @@ COARSE_SAMPLING = caution(
     "pixels of {pixel_nm:g} nm sampled at their centres count more light than was collected",
     'set camera.samples_per_pixel = "auto"',
     "howto/planning",
+    subject=Subject.OPTICS,
 )
 
 FAINT_PICTURES = caution(
@@ -50,6 +55,7 @@ FAINT_PICTURES = caution(
     "above {least:g}",
     "take heavier particles, more frames, or more light",
     "howto/planning",
+    subject=Subject.OPTICS,
 )
 
 PICTURES_LEFT_OUT = note(
@@ -57,4 +63,5 @@ PICTURES_LEFT_OUT = note(
     "of {events} pictures iscat calibrate optics uses the {used} brightest",
     "",
     "howto/planning",
+    subject=Subject.OPTICS,
 )

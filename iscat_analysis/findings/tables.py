@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from functools import partial
 
-from iscat_analysis.findings import registry
+from iscat_analysis.findings.registry import Subject, makers
 
 _CALIBRATION = "howto/calibration"
 
-note, caution = (
-    partial(define, page="howto/answers") for define in (registry.note, registry.caution)
-)
+note, caution, _ = (partial(make, page="howto/answers") for make in makers(Subject.ERRORS))
 
 AS_READ = note("table-as-read", "{text}")
 MASSES_REPLACED = note(
     "masses-replaced",
     "masses are those of `calibration`, {times:.4g} times the table's own (median)",
+    subject=Subject.SCALE,
 )
 REJECTED_BY_HAND = note("events-rejected-by-hand", "{amount} that somebody rejected left out")
 NO_ERRORS = caution(
@@ -101,6 +100,7 @@ SCALE_NOT_IN_SHIFTS = note(
     "scale-not-in-shifts",
     "errors of shifts do not include that of the mass scale: samples with different calibrations "
     "may differ by it (systematic_mass_kda of the tables)",
+    subject=Subject.SCALE,
 )
 MANY_COMPARISONS = note(
     "many-comparisons",
@@ -162,9 +162,13 @@ STANDARDS_SCATTER = caution(
     "the standards scatter about the line by more than their errors (χ²/dof = {chi2_per_dof:.3g}); "
     "its uncertainty is widened by {widened:.3g}",
     page=_CALIBRATION,
+    subject=Subject.SCALE,
 )
 TWO_STANDARDS = note(
-    "two-standards", "two standards fix a line but cannot test it; a third would", page=_CALIBRATION
+    "two-standards",
+    "two standards fix a line but cannot test it; a third would",
+    page=_CALIBRATION,
+    subject=Subject.SCALE,
 )
 NO_RECORDED_OPTICS = caution(
     "no-recorded-optics",
@@ -172,4 +176,5 @@ NO_RECORDED_OPTICS = caution(
     "record of them and is taken at those that are configured where it is used",
     "give the folder of an analysis, with its config.toml",
     page=_CALIBRATION,
+    subject=Subject.SCALE,
 )

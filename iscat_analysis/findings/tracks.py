@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from iscat_analysis.findings.registry import caution, fault
+from iscat_analysis.findings.registry import Subject, makers
+
+_, caution, fault = makers(Subject.ERRORS)
 
 # ---- times ---------------------------------------------------------------------------------------
 
@@ -10,17 +12,20 @@ FRAME_RATE_UNKNOWN = caution(
     "frame-rate-unknown",
     "camera.frame_rate_hz is not known, so that there is no diffusion coefficient: add it, as in "
     "camera.frame_rate_hz = 331.0; {others}",
+    subject=Subject.CAMERA,
 )
 EXPOSURE_UNKNOWN = caution(
     "exposure-unknown",
     "camera.exposure_ms is not known and taken as the {interval_ms:.3g} ms from frame to frame, "
     "over which motion is averaged: add it if it is shorter",
+    subject=Subject.CAMERA,
 )
 EXPOSURE_IN_SECONDS = caution(
     "exposure-in-seconds",
     "camera.exposure_ms = {exposure_ms:g} is no more than a thousandth of the {interval_ms:.4g} ms "
     "from frame to frame: if it is in seconds, write {written_ms:g}, since motion during the "
     "exposure blurs pictures and changes D",
+    subject=Subject.CAMERA,
 )
 SHORT_FOR_D = caution(
     "short-for-d",
@@ -34,11 +39,13 @@ TRACKED_FRAMES_LEFT_OUT = caution(
     "tracked-frames-left-out",
     "frame{s} {frames} {are} dark, cut off or {repeat} the one before (behind a shutter, dropped "
     "or stuck in the camera); left out, and steps over them count as several frames{many}",
+    subject=Subject.CAMERA,
 )
 BLOCKS_FOLLOW_DRIFT = caution(
     "blocks-follow-drift",
     "the fixed pattern moves, by {x_px:+.3f} pixels in x and {y_px:+.3f} in y in all; {blocks} "
     "blocks of {frames} frames have backgrounds of their own{rest}",
+    subject=Subject.CAMERA,
 )
 NO_PARTICLE_MOVES = caution(
     "no-particle-moves",
@@ -52,13 +59,16 @@ HEIGHTS_SEEM_FIXED = fault(
     'the particles seem to stay at one height, as on a membrane: set track.free = "mass"; with '
     "heights that are free {free} of {free_of} fits are rejected, and with all held at "
     "particle.height_nm = {height_nm:g} it is {fixed} of {fixed_of} in the same frames",
+    subject=Subject.OPTICS,
 )
 
 # ---- optics --------------------------------------------------------------------------------------
 
-TRACKS_NOT_DESCRIBED = fault("tracks-not-described", "{why}")
+TRACKS_NOT_DESCRIBED = fault("tracks-not-described", "{why}", subject=Subject.OPTICS)
 TRACKS_HALF_DESCRIBED = fault(
-    "tracks-half-described", "{verdict}; others are used that describe them better, but: {why}"
+    "tracks-half-described",
+    "{verdict}; others are used that describe them better, but: {why}",
+    subject=Subject.OPTICS,
 )
 
 # ---- motion --------------------------------------------------------------------------------------
@@ -69,6 +79,7 @@ MASSES_CHANGE_TOGETHER = caution(
     "focus drifts: tracks whose masses it changes by more than their errors are flagged "
     "mass_varies",
     "hold the focus, or analyse fewer frames (fit.frames)",
+    subject=Subject.CAMERA,
 )
 TRACKS_CROSS = caution(
     "tracks-cross",
@@ -101,4 +112,5 @@ FRAMES_SEEM_DROPPED = caution(
     "of {pairs} pairs of frames about {share:.0%} show all particles go as far as in two frames: "
     "the camera seems to have dropped frames, and D is too large by about as much",
     "compare the times of the frames, and write fewer pixels or slower",
+    subject=Subject.CAMERA,
 )

@@ -120,7 +120,7 @@ def fit_stack(
             run = Run(notify, progress, partial, executor or Executor(), inject)
             analysis = analyse(movie, config, run, command=command)
         with parts_kept(partial if kind.keeps_parts else None):
-            write_report(analysis, folder, overwrite=overwrite, event_figures=kind.event_figures)
+            write_report(analysis, folder, overwrite=overwrite)
         if not analysis.summary["interrupted"]:
             remove_parts(partial)
     if analysis.summary["interrupted"]:

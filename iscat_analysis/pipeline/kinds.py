@@ -21,7 +21,6 @@ from iscat_analysis.fitting.ranges import background_mode
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.records import EventView, FloatArray
-from iscat_analysis.report import EVENT_FIGURES
 
 if TYPE_CHECKING:
     from iscat_analysis.pipeline.stored import StoredResult
@@ -115,8 +114,6 @@ class Kind:
         Prepares the images of stored rows.
     inject : callable or None
         Adds known particles and analyses the movie again; None where none can be added.
-    event_figures : int
-        Events that are drawn for print.
     keeps_parts : bool
         Finished parts are kept on disk, from which an interrupted run goes on.
     """
@@ -126,7 +123,6 @@ class Kind:
     search: Callable[[Prepared], Search]
     stored: Callable[[Prepared, StoredResult], Redraw]
     inject: Callable[[Prepared, Run, DetectionResult], dict[str, Any]] | None = None
-    event_figures: int = EVENT_FIGURES
     keeps_parts: bool = True
 
 

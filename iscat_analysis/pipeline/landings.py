@@ -420,5 +420,4 @@ def _step(neighbours: Neighbours, row: pd.Series[Any], corner: tuple[int, int]) 
 
 LANDING = Kind(
     "landing", find_landings, LandingSearch, StoredSteps, inject_and_recover,
-    event_figures=2,  # the page shows hundreds
 )  # fmt: skip

@@ -19,20 +19,16 @@ from iscat_analysis.report.output import (
     atomic_folder,
     check_output,
 )
-from iscat_analysis.report.tables import event_table, write_posterior, write_tables
+from iscat_analysis.report.tables import write_posterior, write_tables
 
 if TYPE_CHECKING:
     from iscat_analysis.report.benchmark import render_benchmark, render_challenge
     from iscat_analysis.report.movie_page import render_report
     from iscat_analysis.report.page import render_page
 
-EVENT_FIGURES = 12
-"""Events whose images are drawn into the folder, at most."""
-
 __all__ = [
     "BENCHMARK_NAMES",
     "CHALLENGE_NAMES",
-    "EVENT_FIGURES",
     "OUTPUT_NAMES",
     "atomic_folder",
     "check_output",
@@ -54,37 +50,23 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-def write_report(
-    analysis: Analysis, folder: Path, *, overwrite: bool = False, event_figures: int = EVENT_FIGURES
-) -> Path:
+def write_report(analysis: Analysis, folder: Path, *, overwrite: bool = False) -> Path:
     """Write everything one analysis found into a folder.
 
     ``fits.csv``, ``fits.parquet``, in mode ``track`` ``tracks.csv`` and ``tracks.parquet``,
     ``summary.json``, ``config.toml``, ``posterior.nc`` (where a posterior converged),
-    ``response.csv`` (where the camera is not linear), ``report.html`` and ``figures/``.  The folder
-    appears complete or not at all; an earlier result is replaced only once the new one is complete.
+    ``response.csv`` (where the camera is not linear) and ``report.html``.  The folder appears
+    complete or not at all; an earlier result is replaced only once the new one is complete.
     """
     with atomic_folder(folder, overwrite) as building:
-        fill_report(analysis, building, event_figures=event_figures)
+        fill_report(analysis, building)
     return folder
 
 
-def fill_report(analysis: Analysis, folder: Path, *, event_figures: int) -> None:
+def fill_report(analysis: Analysis, folder: Path) -> None:
     """Write a report into a folder of its own."""
-    from iscat_analysis.report.movie_page import (  # Matplotlib takes long to load
-        page_context,
-        page_of,
-        page_sketches,
-        publish_figures,
-    )
+    from iscat_analysis.report.movie_page import render_report
 
-    pictures = folder / "figures"
-    pictures.mkdir(exist_ok=True)
     write_tables(analysis, folder)
     write_posterior(analysis, folder / "posterior.nc")
-    figures = publish_figures(analysis, pictures, event_figures)
-    table = event_table(analysis)
-    about = page_context(analysis, table, pictures)
-    shown = [name for name, _ in page_sketches(analysis, table)]
-    page = page_of(about, {name: figures[name] for name in shown if name in figures})
-    (folder / "report.html").write_text(page, encoding="utf-8")
+    (folder / "report.html").write_text(render_report(analysis), encoding="utf-8")

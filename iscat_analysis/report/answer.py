@@ -259,9 +259,10 @@ def _of_events(main: Quantity, summary: Mapping[str, Any], table: pd.DataFrame) 
     if several := _species(main, summary, table):
         return (several,)
     low, middle, high = quartiles(values)
-    if (summary.get("distribution") or {}).get("species") == [] and _differ(table):
+    if not (summary.get("distribution") or {}).get("species") and _differ(table):
         value = f"{number(values.min())} to {number(values.max())}"
-        note = "in events that are not alike and too few to tell species"
+        few = " and too few to tell species" if summary.get("distribution") else ""
+        note = f"in events that are not alike{few}"
         return (Fact(main.label.capitalize(), value, main.unit, note),)
     if values.size == 1:
         return (Fact(main.label.capitalize(), number(middle), main.unit),)
@@ -288,8 +289,9 @@ def species_of(analysis: Analysis) -> pd.DataFrame:
 
     Columns: the quantity that tells species apart, as ``mass_kda``, ``contrast`` where masses have
     no scale, or ``diameter_nm`` of spheres; with ``sigma_`` and ``systematic_`` before that name
-    its standard error, and the error that all events of the movie share; `count`; `share` with
-    the ends of its 95 % interval, `share_low` and `share_high`; `landing` and `leaving`.
+    its standard error, and the error that all events of the movie share; `width`, the standard
+    deviation of the species beyond the errors of its events; `count` and `share`, each with the
+    ends of its 95 % interval, as `share_low` and `share_high`; `landing` and `leaving`.
     """
     main, summary, table = main_quantity(analysis), analysis.summary, counted(analysis.table)
     if analysis.tracks is None:
@@ -310,15 +312,20 @@ def _species_table(main: Quantity, summary: Mapping[str, Any], table: pd.DataFra
     known = [each for each in found if not (each["outlier"] or each.get("background"))]
     ends = ("se", "low", "high", "systematic")
     names = [column, *(f"{stem}_{end}" for end in ends), "count", "fraction", "landing", "leaving"]
-    rows = pd.DataFrame(known, columns=[*names, "fraction_low", "fraction_high"], dtype=float)
+    counts = ("count_low", "count_high", "fraction_low", "fraction_high")
+    wide = ("width_kda", "width_low", "geometric_sd")
+    rows = pd.DataFrame(known, columns=[*names, *counts, *wide], dtype=float)
     values, sigma, low, high, shared = (rows[name] for name in names[:5])
     sigma = sigma.fillna((high - low) / 3.92)
+    width = rows["width_kda"].where(rows["width_low"] > 0, 0.0)
+    width = width.where(rows["geometric_sd"].isna(), values * np.log(rows["geometric_sd"]))
     if main.power and len(rows):
         good = _good(table)
         per = (good[main.column] / good["mass_kda"] ** main.power).abs().to_numpy(float)
         shared, relative = shared * math.nan, main.power * sigma / values
+        width = main.power * width / values
         values = quartiles(per)[1] * values**main.power
-        sigma = relative * values
+        sigma, width = relative * values, width * values
     if (common := _good(table).get(f"systematic_{main.column}")) is not None:
         relative = (common / _good(table)[main.column]).abs().to_numpy(float)
         shared = shared.fillna(quartiles(relative)[1] * values)
@@ -326,9 +333,10 @@ def _species_table(main: Quantity, summary: Mapping[str, Any], table: pd.DataFra
         rows[["landing", "leaving"]] = math.nan
     errors = {f"sigma_{main.column}": sigma, f"systematic_{main.column}": shared}
     shares = {f"share{end}": rows[f"fraction{end}"] for end in ("", "_low", "_high")}
+    kept = ("count", "count_low", "count_high", "landing", "leaving")
     return pd.DataFrame(
-        {main.column: values, **errors, "count": rows["count"], **shares}
-        | {name: rows[name] for name in ("landing", "leaving")}
+        {main.column: values, **errors, "width": width, **shares}
+        | {name: rows[name] for name in kept}
     ).sort_values(main.column, ignore_index=True)
 
 
@@ -373,11 +381,16 @@ def _of_tracks(
     several = _species(DIAMETER, {"sizes": summary.get("sizes")}, good)
     found = []
     for each in (main if main is CONTRAST else MASS, *_OF_TRACKS):
-        value = float(good[each.column].median()) if each.column in good else math.nan
+        values = good[each.column].dropna().abs() if each.column in good else pd.Series([])
         if each.column == "optical_diameter_nm" and several:
             found.append(several)
-        elif math.isfinite(value) and not (several and each in (CONTRAST, MASS)):
-            found.append(Fact(f"Median {each.label}", number(value), each.unit))
+        elif values.empty or (several and each in (CONTRAST, MASS)):
+            continue
+        elif each in (CONTRAST, MASS) and _differ(good):
+            ends, why = f"{number(values.min())} to {number(values.max())}", "in tracks not alike"
+            found.append(Fact(each.label.capitalize(), ends, each.unit, why))
+        else:
+            found.append(Fact(f"Median {each.label}", number(values.median()), each.unit))
     return tuple(found)
 
 

@@ -1,21 +1,24 @@
-"""The report page of one analysis, and its figures."""
+"""The result page of one analysis: the answer first, and below it what it rests on.
+
+The first screen says what is in the sample and whether to believe it, in numbers; everything else
+is unfolded.  The page draws its figures itself from `movie_figures`, and particles that are
+selected in one figure are marked in all.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
-from functools import partial
-from itertools import chain
-from pathlib import Path, PurePath
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from markupsafe import Markup, escape
 
-from iscat_analysis.findings import Severity
+from iscat_analysis.findings import Finding, Severity, Subject
+from iscat_analysis.findings.results import NOT_A_MASS, NOTHING_FOUND
 from iscat_analysis.records import (
     EVENTS,
     PARAMETERS,
@@ -23,40 +26,25 @@ from iscat_analysis.records import (
     Analysis,
     EventView,
     FloatArray,
-    Status,
-    free_parameters,
+    counted,
     tally,
 )
 from iscat_analysis.report.answer import (
-    CONTRAST,
     EVENTS_KIND,
     TRACKS_KIND,
-    Precision,
     RowKind,
     answers,
-    as_contrasts,
     caution,
-    headline,
     is_uncalibrated,
-    label_of,
     main_parameter,
-    main_quantity,
-    not_a_mass,
     precision_of,
-    row_kind,
+    rejection,
     species_widths,
     track_lines,
     tracks_of,
 )
-from iscat_analysis.report.event_figures import (
-    corner_figures,
-    event_details,
-    event_figures,
-    films_shown,
-)
-from iscat_analysis.report.figures import page_figures
+from iscat_analysis.report.movie_figures import COLOURS, Sample, movie_figures
 from iscat_analysis.report.numbers import (
-    LABELS,
     UNITS,
     Fact,
     Table,
@@ -70,16 +58,9 @@ from iscat_analysis.report.numbers import (
     with_interval,
     worded,
 )
-from iscat_analysis.report.page import Section, render_page
-from iscat_analysis.report.species import (
-    distribution_section,
-    sizes_figure,
-    sizes_section,
-    species_figure,
-)
-from iscat_analysis.report.style import Sketch, drawn, publish
-from iscat_analysis.report.tables import event_table
-from iscat_analysis.schemas import jsonable
+from iscat_analysis.report.page import render_page
+from iscat_analysis.report.pictures import event_details, films_shown
+from iscat_analysis.report.vega import VegaFigure, figure, payload
 from iscat_analysis.units import count
 
 _MODES = {
@@ -88,10 +69,6 @@ _MODES = {
     "joint": "position in three dimensions and mass",
     "size": "position in three dimensions and diameter of a sphere",
     "track": "position and mass in every frame, linked into tracks",
-}
-_SIGNS = {
-    "mass_kda": "Negative masses are particles that leave.",
-    "contrast": "Dark particles that land, and bright ones that leave, have negative contrast.",
 }
 _DECIMALS = {
     **dict.fromkeys(("chi2_reduced", "p_value", "exponent", "p_confinement", "p_anomalous"), 2),
@@ -106,140 +83,84 @@ _REMARKS = {
 }
 
 
+MUCH_NOISE = 0.2
+"""Share by which the variance may differ from the light's before it is doubted."""
+
+
 # ---- The whole page ------------------------------------------------------------------------------
 
 
-def render_report(analysis: Analysis, *, folder: Path | None = None) -> str:
-    """Make the report page of one analysis, and write its figures."""
-    table = event_table(analysis)
-    about = page_context(analysis, table, folder)
-    return page_of(about, publish(drawn(page_sketches(analysis, table)), folder))
+def render_report(analysis: Analysis) -> str:
+    """Make the result page of one analysis, with everything that it shows inside."""
+    return render_page("report.html", page_context(analysis, movie_figures(analysis)))
 
 
-def publish_figures(analysis: Analysis, folder: Path, most: int) -> dict[str, Markup]:
-    """Write the figures of a folder, images of `most` events at most."""
-    sketches = chain(page_sketches(analysis, event_table(analysis)), event_figures(analysis, most))
-    return publish(drawn(sketches), folder)
-
-
-def page_sketches(analysis: Analysis, table: pd.DataFrame) -> Iterator[Sketch]:
-    """List the figures of the page, with the functions that draw them."""
-    yield from page_figures(analysis, table)
-    if (found := _described(analysis, table, "distribution")) is not None:
-        yield "species", partial(species_figure, found)
-    if (sizes := _described(analysis, table, "sizes")) is not None:
-        yield "sizes", partial(sizes_figure, sizes)
-    yield from corner_figures(analysis)
-
-
-def page_of(about: Mapping[str, Any], figures: Mapping[str, Markup]) -> str:
-    """Combine text and figures."""
-    shown = {
-        "figures": figures,
-        "histogram": next((name for name in figures if name.endswith("_histogram")), None),
-        "corners": [name for name in figures if name.startswith("corner_")],
-        "species": about["species"] and about["species"](figures),
-    }
-    return render_page("report.html", {**about, **shown})
-
-
-def _described(analysis: Analysis, table: pd.DataFrame, name: str) -> dict[str, Any] | None:
-    """Give what ``summary.json`` holds of species or sizes, where the rows are a fair sample.
-
-    Single frames of a track may be flagged as much as they like.
-    """
-    tracked = name == "sizes" and analysis.tracks is not None
-    found = analysis.summary.get(name) if tracked or caution(table) is None else None
-    described = jsonable(found) if found else None
-    return described if described and described.get("species", True) else None
-
-
-def _species(
-    analysis: Analysis, table: pd.DataFrame
-) -> tuple[str, Callable[[Mapping[str, Markup]], Section | None]] | None:
-    """Give the title of the section of species, or of sizes, and what makes it of the figures."""
-    if (sizes := _described(analysis, table, "sizes")) is not None:
-        return "Sizes", partial(sizes_section, sizes)
-    if (found := _described(analysis, table, "distribution")) is None:
-        return None
-
-    def section(figures: Mapping[str, Markup]) -> Section | None:
-        made = distribution_section(found, figures)
-        if made is None or not is_uncalibrated(analysis):
-            return made
-        return replace(made, lead=f"On the model's own scale, which is not a mass. {made.lead}")
-
-    return "Species", section
-
-
-def page_context(
-    analysis: Analysis, table: pd.DataFrame, folder: Path | None = None
-) -> dict[str, Any]:
-    """Collect everything that ``report.html`` shows except figures."""
-    kind, source = row_kind(analysis), analysis.provenance.input_path
-    rows, facts, cells = _SHOWN[kind](analysis, table)
-    images = event_details(analysis, rows)
+def page_context(analysis: Analysis, figures: Mapping[str, VegaFigure]) -> dict[str, Any]:
+    """Collect everything that ``report.html`` shows."""
+    sample = Sample(analysis)
+    kind = sample.kind
     sampled = [view for view in analysis.views if view.posterior is not None]
-    started, title = _when(analysis.provenance.started), analysis.scheme_kind.title
-    title = title.capitalize() if title.islower() else title
-    cautions, lines = not_a_mass(analysis), headline(analysis, table)
-    free = free_parameters(analysis.mode, table)
-    precision = [precision_of(analysis, table, name) for name in free]
-    kept = f"images of the first {len(images)} of {len(rows)} rows"
-    left_out = (
-        f"To keep this page small it holds the {kept}." if 0 < len(images) < len(rows) else ""
-    )
-    ranks = list(Severity)
-    findings = sorted(analysis.findings, key=lambda f: -ranks.index(f.severity))
-    species = _species(analysis, table)
-    context: dict[str, Any] = {
-        "title": PurePath(source.replace("\\", "/")).name or "Analysis",
-        "subtitle": f"{title}, mode {analysis.mode}: {_MODES[analysis.mode]}. {started}".rstrip(),
-        "footer": "iscat-analysis "
-        f"{analysis.provenance.versions.get('iscat-analysis', '')}, {started}".rstrip(", "),
-        "tracked": kind is TRACKS_KIND,
-        "n_events": len(rows),
-        "cautions": [line for line in lines if line in cautions],
-        "headline": [line for line in lines if line not in cautions],
-        "flagged": bool(len(rows)) and caution(rows, kind) is not None,
-        "tiles": facts,
-        "totals": f"{tally(rows).text(kind.noun)}.",
-        "precision": _precision_table(analysis, precision),
-        "has_holevo": any(math.isfinite(p.holevo) for p in precision),
-        "budget": _budget_table(analysis),
+    images = event_details(analysis, sample.rows)
+    columns = _columns(sample)
+    holds = {
+        **payload(figures),
+        "trace": figure("trace", {}).specification,
+        "table": columns,
+        "images": images,
+        "kind": kind.noun,
+        "movie": _movie_name(analysis),
+        "unit": sample.quantity.unit,
+        "rows": len(sample.rows),
+    }
+    left_out = f"images of the first {len(images)} of {len(sample.rows)} are in this page"
+    return {
+        "title": _movie_name(analysis) or "Analysis",
+        "meta": _meta(analysis),
+        "footer": f"iscat-analysis {analysis.provenance.versions.get('iscat-analysis', '')}",
+        "answer_title": sample.quantity.label.capitalize() if len(sample.rows) else "Nothing found",
+        "answer_axis": sample.quantity.axis,
+        "counts": tally(sample.rows).text(kind.noun),
+        "species": _species_table(sample),
+        "facts": [] if sample.species else _facts(sample),
+        "trust": trust(sample),
+        "findings": _all_findings(sample),
+        "figures": figures,
+        "noun": kind.noun,
+        "tables": ["fits", "tracks"] if kind is TRACKS_KIND else ["fits"],
+        "rows": len(sample.rows),
+        "headings": [column["heading"] for column in columns],
+        "embedding": left_out if 0 < len(images) < len(sample.rows) else "",
+        "payload": holds,
+        "films": list(films_shown(analysis)),
+        "precision": _precision_table(sample),
+        "budget": _budget_table(sample),
         "spread_lines": species_widths(analysis.summary),
-        "warnings": [f.text for f in findings if f.severity is not Severity.NOTE],
-        "notes": [f.text for f in findings if f.severity is Severity.NOTE],
-        "main_label": main_quantity(analysis).label.capitalize(),
-        "signs": _SIGNS.get(main_quantity(analysis).column),
-        "events": _openable(kind, rows, cells),
-        "has_traces": any(detail.trace for detail in images.values()),
-        "images": {str(row): list(packed) for row, packed in images.items()},
-        "embedding_note": left_out,
-        "films": list(films_shown(analysis, folder)),
-        "track_lines": list(track_lines(analysis.summary)),
-        "posterior": _posterior_table(sampled, table),
+        "lines": [*track_lines(analysis.summary), *measured_lines(analysis.summary)],
+        "posterior": _posterior_table(sampled, sample.fits),
         "refused": _refused_table(sampled),
-        "verdicts": _verdicts(analysis, table),
-        "measured": list(measured_lines(analysis.summary)),
+        "corners": [name for name in figures if name.startswith("corner_")],
+        "verdicts": _verdicts(analysis, sample.fits),
+        "notes": _species_notes(sample),
         "config": analysis.config_toml,
         "provenance": _provenance(analysis),
-        "species": species and species[1],
     }
-    parts = (
-        ("summary", "Summary", True),
-        ("distributions", "Distributions" if len(table) else "Field", True),
-        ("films", "Films", context["films"]),
-        ("species", species and species[0], species),
-        ("precision", "Precision", len(table)),
-        ("budget", "Budget", context["budget"].rows and len(table)),
-        ("events", f"{kind.noun.capitalize()}s", len(rows)),
-        ("posterior", "Posterior", context["posterior"].rows or context["refused"].rows),
-        ("diagnostics", "Diagnostics", True),
-        ("configuration", "Configuration", True),
-        ("provenance", "Provenance", True),
-    )
-    return {**context, "nav": [(name, title) for name, title, shown in parts if shown]}
+
+
+def _movie_name(analysis: Analysis) -> str:
+    return PurePath(analysis.provenance.input_path.replace("\\", "/")).name
+
+
+def _meta(analysis: Analysis) -> str:
+    """Say what was analysed: frames, seconds, microscope and mode."""
+    shape = (analysis.summary.get("input") or {}).get("shape")
+    parts = []
+    if shape is not None:
+        rate = (analysis.summary.get("motion") or {}).get("frame_rate_hz")
+        parts.append(f"{count(shape[0], 'frame')} of {shape[2]} × {shape[1]} pixels")
+        parts += [f"{number(shape[0] / rate)} s"] if rate else []
+    title = analysis.scheme_kind.title
+    parts += [title, f"mode {analysis.mode}: {_MODES[analysis.mode]}"]
+    return " · ".join([*parts, *filter(None, [_when(analysis.provenance.started)])])
 
 
 def _provenance(analysis: Analysis) -> list[tuple[str, Any]]:
@@ -264,52 +185,242 @@ def _when(started: str) -> str:
     return f"{moment.day} {moment:%B %Y, %H:%M}{zone}"
 
 
-# ---- Large numbers -------------------------------------------------------------------------------
+# ---- The answer ----------------------------------------------------------------------------------
 
 
-def _facts(analysis: Analysis, table: pd.DataFrame) -> list[Fact]:
-    """Make the large numbers at the top: counts and precision."""
-    rows, found = tally(table), answers(analysis, table)
-    facts = [Fact("Events", str(rows.number), note=f"{rows.ok} ok, {rows.flagged} flagged"), *found]
-    if not found:
-        return facts
+def _species_table(sample: Sample) -> list[dict[str, Any]]:
+    """Tabulate the species, each number beside its error or interval."""
+    rows = []
+    for k, each in enumerate(sample.species):
+        digits = decimals_for([each.sigma])
+        width = fixed(each.width, digits)
+        rows.append(
+            {
+                "colour": COLOURS[k % len(COLOURS)],
+                "value": fixed(each.value, digits),
+                "se": fixed(each.sigma, digits),
+                "shared": fixed(each.systematic, digits) if each.systematic > 0 else "",
+                "width": width if width.strip("0.") else "",
+                "count": fixed(each.count, 0),
+                "counts": "–".join(fixed(end, 0) for end in (each.count_low, each.count_high)),
+                "share": percent(each.share, 0),
+                "shares": "–".join(fixed(100 * e, 0) for e in (each.share_low, each.share_high)),
+                "landing": fixed(each.landing, 0),
+                "leaving": fixed(each.leaving, 0),
+            }
+        )
+    return rows
+
+
+def _species_notes(sample: Sample) -> list[str]:
+    found = sample.described("sizes") or sample.described("distribution") or {}
+    return list(found.get("notes", ()))
+
+
+def _facts(sample: Sample) -> list[Fact]:
+    """Give the answer where there are no species: a single value, a range, or a height."""
+    analysis = sample.analysis
+    facts = list(answers(analysis, counted(sample.fits)))
     heights = analysis.summary.get("heights")
-    if heights is not None and not heights["held"]:
+    if facts and heights is not None and not heights["held"]:
         mean, error, spread = (fixed(heights[f"{key}_nm"], 1) for key in ("mean", "mean_se", "sd"))
         note = f"mean, to ± {error}, and standard deviation"
         facts.append(Fact("Heights", f"{mean} ± {spread}", "nm", note))
-    name = main_parameter(analysis)
-    if not (p := precision_of(analysis, table, name)).events:
-        return facts
-    label, unit = LABELS[name], UNITS[name]
-    best, bound = p.best
-    sigma = f"σ {number(p.sigma)}{p.shared}, CRB {number(p.crb)} {unit}"
-    beside = f", {best} {number(bound)} {unit}"
-    if is_uncalibrated(analysis):
-        label, sigma, beside = "contrast", "median of the events' own ratios", ""
-    over = Fact(f"σ of {label} over its CRB", number(p.over_crb), "×", sigma)
+    return facts
+
+
+# ---- Whether to believe it -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Trust:
+    """One line of the first screen: whether one subject is as it should be."""
+
+    subject: Subject
+    severity: Severity
+    text: str
+    remedy: str = ""
+    more: int = 0
+    target: str = "findings"
+
+    @property
+    def grade(self) -> str:
+        """Class of its colour."""
+        return {Severity.NOTE: "good", Severity.CAUTION: "warn", Severity.FAULT: "bad"}[
+            self.severity
+        ]
+
+
+def _all_findings(sample: Sample) -> list[Finding]:
+    """List all findings, the most severe first; those of the table of results are among them."""
+    analysis, table = sample.analysis, counted(sample.fits)
+    judged = table if sample.kind is EVENTS_KIND else tracks_of(analysis)
+    found = list(analysis.findings)
+    if table.empty:
+        found.append(NOTHING_FOUND())
+    else:
+        own = (rejection(table), caution(judged, sample.kind) if len(judged) else None)
+        found += [each for each in own if each is not None]
+        found += [NOT_A_MASS()] if is_uncalibrated(analysis) else []
+    ranks = list(Severity)
+    once = {finding.text: finding for finding in found}.values()
+    return sorted(once, key=lambda finding: -ranks.index(finding.severity))
+
+
+def trust(sample: Sample) -> list[Trust]:
+    """Say of camera, optics, errors and scale whether to believe them, the worst first."""
+    found = _all_findings(sample)
+    lines = []
+    for subject, reassure in _REASSURING.items():
+        doubts = [
+            each
+            for each in found
+            if each.kind.subject is subject and each.severity is not Severity.NOTE
+        ]
+        if doubts:
+            first = doubts[0]
+            lines.append(Trust(subject, first.severity, *first.brief, len(doubts) - 1))
+        elif (line := reassure(sample)) is not None:
+            lines.append(line)
+    ranks = list(Severity)
+    return sorted(lines, key=lambda line: -ranks.index(line.severity))
+
+
+def _camera(sample: Sample) -> Trust | None:
+    summary = sample.analysis.summary
+    found = summary.get("landing") or summary.get("background") or {}
+    ratios = [ratio for ratio in found.get("noise_variance_over_shot", ()) if ratio is not None]
+    text, severity = "Nothing is wrong with the camera's numbers", Severity.NOTE
+    if ratios and abs(ratios[0] - 1) < MUCH_NOISE:
+        text = f"The camera's noise is as expected: {fixed(ratios[0], 2)} × that of the light"
+    elif ratios:
+        text, severity = f"The noise is {number(ratios[0])} × that of the light", Severity.CAUTION
+    return Trust(Subject.CAMERA, severity, text, target="diagnostics")
+
+
+def _optics(sample: Sample) -> Trust | None:
+    p_values = counted(sample.fits)["p_value"].dropna()
+    if not p_values.size:
+        return None
+    good = int((p_values >= 0.01).sum())
+    text = f"The optics describe the particles: p ≥ 0.01 for {good} of {p_values.size} fits"
+    return Trust(Subject.OPTICS, Severity.NOTE, text, target="diagnostics")
+
+
+def _errors(sample: Sample) -> Trust | None:
+    table = counted(sample.fits)
+    p = precision_of(sample.analysis, table, main_parameter(sample.analysis))
     if p.is_measured:
-        low, high = (fixed(end, 2) for end in p.measured_ci95)
-        note = f"95 % {low} to {high}; {sigma}"
-        over = Fact(f"Measured spread of {label} over its CRB", fixed(p.measured, 2), "×", note)
-    used = percent(p.information)
-    information = Fact(f"Information on {label} used", used, note=f"({best} / CRB)²{beside}")
-    return [*facts, over, information]
+        text = f"Errors are right: the measured spread is {p.measured_text} times the bound"
+    elif p.events:
+        text = "Errors follow from the noise; there are too few frames to measure them"
+    else:
+        return None
+    return Trust(Subject.ERRORS, Severity.NOTE, text, target="precision")
 
 
-def _track_facts(analysis: Analysis, fits: pd.DataFrame) -> list[Fact]:
-    rows = tally(tracks_of(analysis))
-    note = f"{rows.ok} ok, {rows.flagged} flagged; {len(fits)} fitted positions"
-    found = answers(analysis, fits)
-    over = (replace(answer, note="over tracks that are ok") for answer in found)
-    return [Fact("Tracks", str(rows.number), note=note), *over]
+def _scale(sample: Sample) -> Trust | None:
+    budget = sample.analysis.summary.get("budget", ())
+    shared = [one["sigma_rel"] for one in budget if one["common"] and one["sigma_rel"]]
+    if not shared:
+        return None
+    worst = max((one for one in budget if one["common"]), key=lambda one: one["sigma_rel"] or 0)
+    sized = sample.quantity.column.endswith("diameter_nm")
+    known = math.hypot(*shared) / (3 if sized else 1)
+    what = (
+        "diameters"
+        if sized
+        else f"{sample.quantity.label}{'es' if sample.quantity.label.endswith('s') else 's'}"
+    )
+    text = f"The scale of {what} is known to ± {percent(known)}"
+    remedy = f"Most of it: {worst['name']}"
+    return Trust(Subject.SCALE, Severity.NOTE, text, remedy, target="budget")
+
+
+_REASSURING = {
+    Subject.CAMERA: _camera,
+    Subject.OPTICS: _optics,
+    Subject.ERRORS: _errors,
+    Subject.SCALE: _scale,
+}
+"""What is said of each subject where there is no doubt."""
+
+
+# ---- The table of particles ----------------------------------------------------------------------
+
+
+def _columns(sample: Sample) -> list[dict[str, Any]]:
+    """Write the columns of the table of particles; one without numbers is left out."""
+    kind, rows = sample.kind, sample.rows
+    columns: list[dict[str, Any]] = [
+        {"heading": kind.noun, "of": "event"},
+        {"heading": kind.heading, "of": "frame"},
+    ]
+    columns += [{"heading": heading, "cells": cells} for heading, cells in _shown(sample) if cells]
+    advice, cells = {}, []
+    for status, flags in zip(rows["status"], rows["flags"], strict=True):
+        verdict = kind.status(status)
+        advice[verdict.value] = verdict.advice
+        others = [flag for flag in str(flags).split(";") if flag and flag != verdict]
+        cells.append("; ".join([verdict.value, *others]))
+    return [*columns, {"heading": "status", "cells": cells, "advice": advice}]
+
+
+def _shown(sample: Sample) -> Iterator[tuple[str, list[str]]]:
+    """Write the columns of the table, masses on the scale of the main quantity."""
+    table = sample.scaled(sample.rows)
+    for name, heading in _headings(sample):
+        if name in table:
+            factor = 1e3 if name == "contrast" else 1.0
+            values = factor * table[name].to_numpy(float)
+            error = table.get(f"sigma_{name}") if sample.kind is TRACKS_KIND else None
+            spread = values if error is None else error.to_numpy(float)
+            digits = 3 if error is None and not name.startswith("sigma") else 2
+            yield heading, _cells(name, values, spread, digits)
+
+
+def _headings(sample: Sample) -> Iterator[tuple[str, str]]:
+    """Name the columns of the table: place, each fitted quantity with its errors, fit."""
+    if sample.kind is TRACKS_KIND:
+        unit = sample.unit("mass_kda")
+        for column in (column for column in TRACKS if column.heading):
+            name = column.heading
+            if column.name.endswith("mass_kda"):
+                name = name.replace("mass", sample.label("mass_kda")).replace("kDa", unit)
+            yield column.name, name
+        return
+    headed = [column for column in EVENTS if column.heading]
+    fitted = [name for name in ("z_nm", "mass_kda") if name in sample.analysis.mode_kind.free]
+    own = [column for column in headed if column.name.endswith(PARAMETERS)]
+    rest = [column for column in headed if column not in own]
+    last = rest.index(next(column for column in rest if column.name == "contrast"))
+    yield from ((column.name, column.heading) for column in rest[:last])
+    if sample.label("mass_kda") != "contrast":
+        yield rest[last].name, rest[last].heading
+    for name in fitted:
+        yield name, sample.parameter(name)
+        errors = [column for column in own if column.name.endswith(f"_{name}")]
+        for column in sorted(errors, key=lambda column: "crb_" in column.name):
+            yield column.name, f"{column.heading} [{sample.unit(name)}]"
+    yield from ((column.name, column.heading) for column in rest[last + 1 :])
+
+
+def _cells(name: str, values: FloatArray, spread: FloatArray, digits: int) -> list[str]:
+    """Write a column with so many digits of the median of `spread`; nothing if it is empty."""
+    if not np.isfinite(values).any():
+        return []
+    decimals = _DECIMALS.get(name)
+    if decimals is None:
+        decimals = decimals_for([float(np.nanmedian(np.abs(spread)))], digits=digits)
+    return [fixed(value, decimals) for value in values]
 
 
 # ---- Tables --------------------------------------------------------------------------------------
 
 
-def _precision_table(analysis: Analysis, precision: Sequence[Precision]) -> Table:
-    kind = row_kind(analysis)
+def _precision_table(sample: Sample) -> Table:
+    analysis, kind = sample.analysis, sample.kind
+    precision = [sample.precision_of(name) for name in sample.free]
     where = (
         "of single frames where there is no particle"
         if analysis.mode_kind.follows_tracks
@@ -317,7 +428,7 @@ def _precision_table(analysis: Analysis, precision: Sequence[Precision]) -> Tabl
     )
     has_holevo = any(math.isfinite(p.holevo) for p in precision)
     columns = [
-        worded("Medians", lambda p: f"{label_of(analysis, p['name'])} [{UNITS[p['name']]}]"),
+        worded("parameter", lambda p: sample.parameter(p["name"])),
         numeric("σ", of("sigma"), "from the curvature of the likelihood at its maximum"),
         numeric(
             "common",
@@ -364,13 +475,13 @@ def _precision_table(analysis: Analysis, precision: Sequence[Precision]) -> Tabl
     rows = [
         {**vars(p), "measured_text": p.measured_text if p.is_measured else None} for p in precision
     ]
-    caption = f"{kind.fits} whose status is ok; units in the first column"
+    caption = f"Medians over the {kind.fits.lower()} whose status is ok"
     return replace(tabulate(rows, columns, caption), sortable=False)
 
 
-def _budget_table(analysis: Analysis) -> Table:
+def _budget_table(sample: Sample) -> Table:
     """Tabulate what the error of a mass is made of, and last what is common to all rows."""
-    budget = list(analysis.summary.get("budget", ()))
+    budget = list(sample.analysis.summary.get("budget", ()))
     shared = [one for one in budget if one["sigma_rel"] and one["common"]]
     if len(shared) > 1:
         sigma, share = (
@@ -394,6 +505,8 @@ def _budget_table(analysis: Analysis) -> Table:
         numeric("degrees of freedom", of("dof", freedom)),
         worded("what shrinks it", "remedy"),
     ]
+    if sample.unit("mass_kda") != UNITS["mass_kda"]:
+        columns = [column for column in columns if column.label != "σ [kDa]"]
     made = tabulate(budget, columns, "Medians over the rows whose status is ok")
     return replace(made, sortable=False)
 
@@ -460,100 +573,6 @@ def _verdict_table(kind: RowKind, rows: pd.DataFrame, counted: str, caption: str
     meaning = "what it means, and what to try"
     columns = (worded("status or flag", 0), numeric(counted, 1), worded(meaning, 2))
     return tabulate(found, columns, caption)
-
-
-# ---- The table whose rows open -------------------------------------------------------------------
-
-
-def _events_shown(analysis: Analysis, table: pd.DataFrame) -> Shown:
-    """Give the events, their facts and the columns of their table."""
-    shown = []
-    for name, heading in _headings(analysis):
-        if name in table:
-            scale = 1e3 if name == "contrast" else 1.0
-            values = scale * table[name].to_numpy(float)
-            shown.append((heading, _cells(name, values, values, 3)))
-    return table, _facts(analysis, table), shown
-
-
-def _headings(analysis: Analysis) -> Iterator[tuple[str, str]]:
-    """Name the columns of the table of events: place, each fitted quantity with its errors, fit."""
-    headed = [column for column in EVENTS if column.heading]
-    fitted = [name for name in ("z_nm", "mass_kda") if name in analysis.mode_kind.free]
-    own = [column for column in headed if column.name.endswith(PARAMETERS)]
-    rest = [column for column in headed if column not in own]
-    last = rest.index(next(column for column in rest if column.name == "contrast")) + 1
-    yield from ((column.name, column.heading) for column in rest[:last])
-    for name in fitted:
-        yield name, f"{label_of(analysis, name)} [{UNITS[name]}]"
-        errors = [column for column in own if column.name.endswith(f"_{name}")]
-        for column in sorted(errors, key=lambda column: "crb_" in column.name):
-            yield column.name, f"{column.heading} [{column.unit}]"
-    yield from ((column.name, column.heading) for column in rest[last:])
-
-
-def _tracks_shown(analysis: Analysis, table: pd.DataFrame) -> Shown:
-    """Give the tracks, their facts and the columns of their table."""
-    tracks = tracks_of(analysis)
-    names = {column.name: column.heading for column in TRACKS if column.heading}
-    scale = 1.0
-    if main_quantity(analysis) is CONTRAST:
-        tracks, scale = as_contrasts(tracks) if len(tracks) else tracks, 1e3
-        for name in (name for name in names if name.endswith("mass_kda")):
-            names[name] = names[name].replace("mass", "contrast").replace("kDa", "10⁻³")
-    elif is_uncalibrated(analysis):
-        names["mass_kda"] = "mass, model scale [kDa]"
-    shown = []
-    for name, heading in names.items():
-        if name in tracks:
-            factor = scale if name.endswith("mass_kda") else 1.0
-            error = tracks.get(f"sigma_{name}")
-            digits = 3 if error is None and not name.startswith("sigma") else 2
-            columns = (tracks[name], tracks[name] if error is None else error)
-            values, spread = (factor * column.to_numpy(float) for column in columns)
-            shown.append((heading, _cells(name, values, spread, digits)))
-    numbered = tracks_of(analysis).rename(columns={"track": "event"})
-    return numbered, _track_facts(analysis, table), shown
-
-
-Shown = tuple[pd.DataFrame, list[Fact], list[tuple[str, list[str]]]]
-_SHOWN: Mapping[RowKind, Callable[[Analysis, pd.DataFrame], Shown]] = {
-    EVENTS_KIND: _events_shown,
-    TRACKS_KIND: _tracks_shown,
-}
-
-
-def _cells(name: str, values: FloatArray, spread: FloatArray, digits: int) -> list[str]:
-    """Write a column with so many digits of the median of `spread`; nothing if it is empty."""
-    if not np.isfinite(values).any():
-        return []
-    decimals = _DECIMALS.get(name)
-    if decimals is None:
-        decimals = decimals_for([float(np.nanmedian(np.abs(spread)))], digits=digits)
-    return [fixed(value, decimals) for value in values]
-
-
-def _openable(
-    kind: RowKind, table: pd.DataFrame, shown: Sequence[tuple[str, list[str]]]
-) -> dict[str, Any]:
-    """Write the rows of a table that a page opens; a column without numbers is left out."""
-    columns = [(heading, cells) for heading, cells in shown if cells]
-    lines = []
-    for row in range(len(table)):
-        status = kind.status(table["status"].iloc[row])
-        flags = [f for f in str(table["flags"].iloc[row]).split(";") if f and f != status]
-        mark = "status" if status == Status.OK.value else "status flagged"
-        numbers = "".join(f'<td class="num">{cells[row]}' for _, cells in columns)
-        lines.append(
-            f'<tr id="row-{row}"><td><button type="button" class="toggle" aria-expanded="false">'
-            f'{table["event"].iloc[row]}</button><td class="num">{table[kind.begins].iloc[row]}'
-            f'{numbers}<td class="{mark}" title="{escape(status.advice)}">'
-            f"{escape('; '.join([status.value, *flags]))}"
-        )
-    return {
-        "columns": [kind.noun, kind.heading, *(heading for heading, _ in columns), "status"],
-        "body": Markup("\n".join(lines)),  # the only text, the flags, is escaped
-    }
 
 
 # ---- Sentences -----------------------------------------------------------------------------------

@@ -12,7 +12,11 @@ import jinja2
 from markupsafe import Markup
 
 from iscat_analysis.report.numbers import Fact, Table, sentence
+from iscat_analysis.report.vega import VegaFigure, libraries, payload
 from iscat_analysis.text import in_page
+
+LIBRARIES = "/* libraries */"
+"""Where the scripts that draw figures go, on a page that has some."""
 
 OPTICS_FILE = "optics.toml; name it as optics.file in the configuration of the measurement."
 """What is said of an optics.toml on its page."""
@@ -20,13 +24,14 @@ OPTICS_FILE = "optics.toml; name it as optics.file in the configuration of the m
 
 @dataclass(frozen=True)
 class Chart:
-    """A figure on a page."""
+    """A figure on a page: one that the page draws, or a picture that is in it."""
 
     id: str
-    title: str
-    svg: Markup
+    title: str = ""
+    svg: Markup | None = None
     caption: str = ""
     wide: bool = False
+    figure: VegaFigure | None = None
 
 
 @dataclass(frozen=True)
@@ -49,8 +54,11 @@ def render_document(
 ) -> str:
     """Fill a page of sections; `frame` replaces what the frame of a page says by itself."""
     nav = [(part.id, part.short or part.title) for part in sections]
+    charts = {chart.id: chart.figure for part in sections for chart in part.charts}
+    figures = {name: figure for name, figure in charts.items() if figure is not None}
     about = {"title": title, "subtitle": subtitle, "sections": sections, "nav": nav}
-    return render_page("document.html", {**about, **(frame or {})})
+    held = {"payload": payload(figures)} if figures else {}
+    return render_page("document.html", {**about, **held, **(frame or {})})
 
 
 def configuration(toml: str, lead: str) -> Section:
@@ -70,7 +78,9 @@ def render_page(template: str, context: Mapping[str, Any]) -> str:
     other file.
     """
     frame = {"kicker": "iscat-analysis", "subtitle": None, "footer": "iscat-analysis", "nav": ()}
-    return in_page(templates().get_template(template).render({**frame, **context}))
+    frame["payload"] = None
+    page = in_page(templates().get_template(template).render({**frame, **context}))
+    return page.replace(LIBRARIES, libraries()) if context.get("payload") else page
 
 
 @cache
@@ -84,6 +94,9 @@ def templates() -> jinja2.Environment:
         undefined=_AskableUndefined,
     )
     environment.filters["cell"] = _cell
+    environment.filters["coded"] = _coded
+    compact = {"separators": (",", ":"), "ensure_ascii": False, "allow_nan": False}
+    environment.policies["json.dumps_kwargs"] = compact
     return environment
 
 
@@ -92,6 +105,14 @@ class _AskableUndefined(jinja2.StrictUndefined):
 
     def __bool__(self) -> bool:  # type: ignore[override]
         return False
+
+
+def _coded(text: str) -> Markup:
+    """Set what stands between backticks as code."""
+    parts = text.split("`")
+    return Markup("").join(
+        Markup("<code>{}</code>").format(part) if k % 2 else part for k, part in enumerate(parts)
+    )
 
 
 def _cell(value: Any) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,7 +30,7 @@ from iscat_analysis.landing.find import analyse_landings, drift_findings, frame_
 from iscat_analysis.landing.steps import ChunkFitter
 from iscat_analysis.landing.tasks import TaskBuilder
 from iscat_analysis.movie import open_stack
-from iscat_analysis.pipeline import analyse, fit_stack, landings
+from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.pipeline.finish import summary_of
 from iscat_analysis.pipeline.landings import inject_and_recover
 from iscat_analysis.records import EVENT_COLUMNS, FRAME_COLUMN, EventView
@@ -563,7 +563,6 @@ def test_an_interrupted_run_resumes_to_the_same_result(
 ) -> None:
     config = _config("posterior.enabled=false", "background.window_frames=20", "compute.workers=1")
     monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.0031)
-    monkeypatch.setattr(landings, "LANDING", replace(landings.LANDING, event_figures=0))
     fit_stack(movie, config, out=tmp_path / "whole.iscat")
     assert not partial_folder(tmp_path / "whole.iscat").exists()
     real: Callable[..., Any] = chunk_work.analyse_chunk
@@ -747,7 +746,6 @@ def test_an_interrupted_injection_keeps_what_the_movie_gave(
     movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = _config("posterior.enabled=false")
-    monkeypatch.setattr(landings, "LANDING", replace(landings.LANDING, event_figures=0))
     calls = _interrupted_at_the_second_chunk(monkeypatch)
     out = tmp_path / "cut.iscat"
     with pytest.raises(KeyboardInterrupt):

@@ -8,31 +8,34 @@ import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jinja2
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 import pytest
-from markupsafe import Markup
-from matplotlib.backend_bases import RendererBase
-from matplotlib.figure import Figure
 
 from iscat_analysis.config import load_config, parse_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.findings.results import NOT_A_MASS
 from iscat_analysis.notebook import Result
 from iscat_analysis.pipeline.stored import open_result
-from iscat_analysis.records import EVENT_COLUMNS, Analysis, Status, tally
-from iscat_analysis.report import check_output, figures, render_page, render_report, write_report
+from iscat_analysis.records import EVENT_COLUMNS, Analysis, Status, counted, tally
+from iscat_analysis.report import check_output, render_page, render_report, write_report
 from iscat_analysis.report.answer import answer_in, answers, headline, precision_of
-from iscat_analysis.report.event_figures import CREDIBLE_LEVELS, credible_shades
+from iscat_analysis.report.movie_figures import (
+    CREDIBLE_LEVELS,
+    PICTURE_PX,
+    bin_width,
+    credible_shades,
+    movie_figures,
+)
 from iscat_analysis.report.movie_page import measured_lines
 from iscat_analysis.report.numbers import number, numeric, tabulate, worded
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder
 from iscat_analysis.report.page import Chart, Section, render_document
-from iscat_analysis.report.style import new_figure, publish
 from iscat_analysis.report.tables import event_table
+from iscat_analysis.report.vega import figure, figures_in, libraries
 from iscat_analysis.schemas import jsonable
 from iscat_analysis.species import describe
 
@@ -40,8 +43,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from report_factory import HOSTILE, make_analysis, with_traces, without_events
 
 
-def payload(page: str) -> dict[str, object]:
-    found = re.search(r'<script type="application/json" id="images">(.*?)</script>', page, re.S)
+def payload(page: str) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)
     assert found is not None
     return dict(json.loads(found.group(1)))
 
@@ -53,51 +56,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_report(analysis, tmp_path_factory.mktemp("out") / "movie.iscat")
 
 
-def test_a_figure_is_drawn_once_for_each_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn: list[Figure] = []
-    draw = Figure.draw
-
-    def count(figure: Figure, renderer: RendererBase) -> None:
-        drawn.append(figure)
-        draw(figure, renderer)
-
-    monkeypatch.setattr(Figure, "draw", count)
-    figure = new_figure(2.0, 1.5)
-    figure.add_subplot().plot([0, 1], [0, 1])
-    with mpl.rc_context({"figure.constrained_layout.use": True}):  # as a user may have it
-        publish([("line", figure)], tmp_path)
-    assert drawn == [figure, figure]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["line.png", "line.svg"]
-
-
-def test_names_of_axes_are_where_they_would_be_without_an_image_drawn_before(
-    tmp_path: Path,
-) -> None:
-    """In an image letters have whole pixels, which makes numbers beside an axis a little wider."""
-
-    def places(folder: Path | None) -> list[tuple[str, float, float]]:
-        figure = new_figure(6.0, 2.5)
-        left, right = figure.subplots(1, 2)
-        left.plot([0, 1], [0.0, 1e-4])
-        left.set(xlabel="frames", ylabel="narrow")
-        right.semilogy([0, 1e5], [1e-3, 1e7])
-        right.set(xlabel="nothing", ylabel="wide")
-        svg = publish([("axes", figure)], folder)["axes"]
-        found = re.findall(r'x="([-.0-9]+)" y="([-.0-9]+)"[^>]*>([a-z ]+)</text>', svg)
-        return [(name, float(x), float(y)) for x, y, name in found]
-
-    alone, after = places(None), places(tmp_path)
-    assert {name for name, *_ in after} == {"frames", "narrow", "nothing", "wide"}
-    assert [name for name, *_ in after] == [name for name, *_ in alone]
-    moved = np.array([p for _, *p in after]) - np.array([p for _, *p in alone])
-    assert np.abs(moved).max() < 2.0  # points, where a letter has 9
-
-
 class TestFolder:
     def test_holds_exactly_what_is_promised_and_has_no_sibling(self, folder: Path) -> None:
-        others = {"tracks.csv", "tracks.parquet", "response.csv"}
+        others = {"tracks.csv", "tracks.parquet", "response.csv", "figures"}
         assert {path.name for path in folder.iterdir()} == OUTPUT_NAMES - others
         assert [path.name for path in folder.parent.iterdir()] == [folder.name]
 
@@ -121,26 +82,30 @@ class TestFolder:
         )
         assert load_config(folder / "config.toml") == expected
 
-    def test_figures_come_in_pairs(self, folder: Path) -> None:
-        stems = {path.stem for path in (folder / "figures").glob("*.png")}
-        assert stems == {path.stem for path in (folder / "figures").glob("*.svg")}
-        assert {"overview", "precision", "mass_histogram", "timeline", "event_0000"} <= stems
-        assert {stem for stem in stems if "corner" in stem} == {"corner_0001", "corner_0002"}
+    def test_the_page_holds_its_figures_as_data(self, folder: Path) -> None:
+        found = figures_in(folder / "report.html")
+        again = movie_figures(make_analysis(8, "joint", posteriors=2, refused=1))
+        assert {"masses", "field", "time", "limit", "precision", "budget", "chi2"} <= set(found)
+        assert {name for name in found if "corner" in name} == {"corner_0001", "corner_0002"}
+        for name in ("masses", "time", "limit"):
+            assert found[name].to_dict()["datasets"] == again[name].to_dict()["datasets"]
 
     def test_the_budget_is_drawn_and_adds_up(self, folder: Path) -> None:
         page = (folder / "report.html").read_text(encoding="utf-8")
-        assert (folder / "figures" / "budget.svg").is_file()
-        rows = re.findall(r"<tr>(.*?)</tr>", page[page.index('id="budget"') :], re.DOTALL)
+        assert "photon noise" in figures_in(folder / "report.html")["budget"].data["budget"]["name"]
+        rows = re.findall(r"<tr>(.*?)</tr>", page[page.index('<details id="budget"') :], re.DOTALL)
         cells = [re.findall(r"<td[^>]*>(.*?)</td>", row, re.DOTALL) for row in rows[:6]]
-        said = {row[0]: row[3:5] for row in cells if row}
+        said = {row[0].strip(): row[3:5] for row in cells if row}
         assert said["photon noise"] == ["6.00", "1.2 %"]
         assert said["scale of the model"] == ["—", "—"]
         assert said["all that is shared"] == ["6.00", "1.2 %"]  # of 4.8 and 3.6
 
     def test_page_fetches_nothing_and_escapes_file_names(self, folder: Path) -> None:
         page = (folder / "report.html").read_text(encoding="utf-8")
+        page = page.replace(libraries(), "")
         outside = set(re.findall(r"https?://[^\"' )]+", page))
-        assert outside == {"http://www.w3.org/2000/svg"}  # the icon
+        schema = "https://vega.github.io/schema/vega-lite/v6.json"  # a name, which nobody fetches
+        assert outside == {"http://www.w3.org/2000/svg", schema}
         assert not re.search(r"@import|<link(?![^>]*data:)|src=\"(?!data:)", page)
         for text in (HOSTILE, "<script>alert", "<img"):
             assert text not in page
@@ -221,7 +186,8 @@ def test_every_mode_and_scheme_makes_a_page(
     analysis = make_analysis(60, mode, scheme=scheme, side=16)
     page = render_report(analysis)
     assert f"mode {mode}" in page
-    assert len(payload(page)) == (60 if mode != "track" else 6)
+    shown = len(counted(analysis.table)) if analysis.tracks is None else len(analysis.tracks)
+    assert len(payload(page)["images"]) == shown
     assert ">nan" not in page
     for status in set(analysis.table["status"]):
         assert Status(status).value in page
@@ -246,20 +212,19 @@ def test_everything_missing_still_makes_a_folder(tmp_path: Path) -> None:
     assert (write_report(bare, tmp_path / "out") / "report.html").exists()
 
 
-def test_the_page_of_5000_events_stays_below_5_mb_and_says_what_it_leaves_out() -> None:
+def test_the_page_of_10000_events_stays_below_3_mb_and_says_what_it_leaves_out() -> None:
     small = with_traces(make_analysis(10))
     many = replace(
         small,
-        table=pd.concat([small.table] * 500, ignore_index=True).assign(event=np.arange(5000)),
-        views=tuple(replace(small.views[i % 10], event=i) for i in range(5000)),
+        table=pd.concat([small.table] * 1000, ignore_index=True).assign(event=np.arange(10_000)),
+        views=tuple(replace(small.views[i % 10], event=i) for i in range(10_000)),
     )
     page = render_report(many)
-    assert len(page.encode()) < 5_000_000
-    assert page.count('<tr id="row-') == 5000
+    assert len(page.encode()) < 3_000_000
     held = payload(page)
-    assert len(held) > 100
-    assert f"the images of the first {len(held)} of 5000 rows" in page
-    assert "the step as a clip" in page
+    assert len(held["datasets"]["events"]["event"]) == 10_000
+    assert len(held["images"]) > 20
+    assert f"images of the first {len(held['images'])} of 10000 are in this page" in page
 
 
 def with_flagged(analysis: Analysis, flagged: int) -> Analysis:
@@ -276,9 +241,10 @@ def test_no_headline_when_more_than_a_fifth_is_flagged(flagged: int, silent: boo
     first = headline(analysis, event_table(analysis))[0]
     assert first.startswith(f"{flagged} of 40 events are flagged") == silent
     assert ("the rest is no fair sample" in first) == (silent and flagged < 40)
-    assert ("Median" in first) != silent
+    assert ("Mass 6" in first) != silent
     page = render_report(analysis)
-    assert ("Median mass" in page) != silent
+    assert ("not alike" in page) != silent
+    assert ("No answer is given" in page) == silent
     assert (Status.POOR_FIT.advice in first) == silent
     assert "×10⁹" not in " ".join(headline(analysis, event_table(analysis)))
     alone = with_flagged(make_analysis(1), 1)
@@ -295,8 +261,8 @@ def test_species_are_shown_for_fair_samples_only() -> None:
         analysis = with_flagged(make_analysis(40), flagged)
         summary = {**analysis.summary, "distribution": found, "mass_scale": scale}
         page = render_report(replace(analysis, summary=summary))
-        assert ('id="species"' in page) == (flagged == 0)
-        assert ("On the model&#39;s own scale" in page) == (scale == "absolute model")
+        assert ("<tr data-species" in page) == (flagged == 0)
+        assert ("Not calibrated" in page) == (scale == "absolute model")
 
 
 @pytest.mark.parametrize("scale", ["calibration", "absolute model"])
@@ -320,8 +286,10 @@ def test_several_species_are_one_answer_everywhere_and_have_no_median(
     answer = f"Species of {quantity} {values}{unit}"
     page = (out / "report.html").read_text(encoding="utf-8")
     shown = " ".join(repr(Result(analysis)).split()), repr(open_result(out))
-    for text in (page, *shown, answer_in(out), headline(analysis, analysis.table)[0]):
+    assert page.count("<tr data-species") == 3
+    for text in (*shown, answer_in(out), headline(analysis, analysis.table)[0]):
         assert answer in text
+    for text in (page, *shown):
         assert "Median mass" not in text
         assert "Median contrast" not in text
     one = {**found, "species": found["species"][:1]}
@@ -345,7 +313,7 @@ def test_side_lobes_are_no_events() -> None:
     """Thirty of forty rows are side lobes with absurd masses: ten events remain, and all count."""
     analysis = with_flagged(make_analysis(40), 30)
     table = event_table(analysis).replace({"status": {"poor_fit": "sidelobe"}})
-    assert headline(analysis, table)[0].startswith("10 events, all of them ok. Median mass")
+    assert headline(analysis, table)[0].startswith("10 events, all of them ok. Mass ")
     assert "×10⁹" not in headline(analysis, table)[0]
     sides = analysis.table.replace({"status": {"poor_fit": "sidelobe"}})
     shown = repr(Result(replace(analysis, table=sides)))
@@ -361,10 +329,12 @@ def test_without_calibration_the_headline_is_a_contrast() -> None:
     assert not any("Not calibrated" in line for line in headline(analysis, event_table(analysis)))
     said = headline(bare, event_table(bare))
     assert f"{NOT_A_MASS().text}." in said
-    assert "Median contrast" in said[0]
+    assert "Contrast 0.00" in said[0]
     assert "kDa" not in said[0]
     page = render_report(bare)
-    assert "mass, model scale [kDa]" in page
+    assert "kDa" not in re.sub(
+        r"<script.*?</script>|<code>.*?</code>|<pre.*?</pre>", "", page, flags=re.S
+    )
     assert "iscat calibrate mass" in page
 
 
@@ -373,11 +343,11 @@ def test_optional_columns_stand_beside_sigma() -> None:
     analysis = make_analysis(40)
     table = analysis.table.assign(systematic_mass_kda=7.0, repeat_mass_kda=np.nan, track=1)
     page = render_report(replace(analysis, table=table))
-    heads = re.findall(r'<th scope="col"[^>]*>([^<]*)</th>', page[page.index('id="table"') :])
+    heads = [column["heading"] for column in payload(page)["table"]]
     at = heads.index("σ [kDa]")
     assert heads[at + 1] == "systematic [kDa]"
     assert "repeats [kDa]" not in heads
-    assert "systematic [kDa]" not in render_report(analysis)
+    assert "systematic [kDa]" not in str(payload(render_report(analysis))["table"])
     shared = ", common to all events 7.00"
     assert shared in repr(Result(replace(analysis, table=table)))
     assert shared not in repr(Result(analysis))
@@ -429,11 +399,12 @@ def test_numbers_are_written_for_people(value: float | None, text: str) -> None:
 
 def test_documents_escape_what_they_are_given_and_need_a_title() -> None:
     columns = worded("a", 0), numeric("b", 1)
+    hostile = {"noise": {"frames": [1], "ratio": ["</script><b>"]}}
     section = Section(
         "one",
         "One",
         notes=["a < b"],
-        charts=[Chart("c", "</script><b>", Markup("<svg></svg>"))],
+        charts=[Chart("c", figure=figure("noise", hostile))],
         tables=[tabulate([["<i>", np.nan], ["x", -1.25]], columns, "t")],
     )
     page = render_document("Bounds & <friends>", "", [section])
@@ -445,38 +416,27 @@ def test_documents_escape_what_they_are_given_and_need_a_title() -> None:
         render_page("document.html", {"sections": []})
 
 
-@pytest.mark.parametrize(
-    ("shape", "said"),
-    [
-        ((64, 64), ""),
-        ((128, 512), ""),
-        ((20, 1000), "pixels are drawn 10 times as tall as wide"),
-        ((1000, 20), "pixels are drawn 10 times as wide as tall"),
-    ],
-)
-def test_no_field_is_drawn_as_a_line(shape: tuple[int, int], said: str) -> None:
-    """Of 20 rows of 1000 pixels the picture was a tenth of an inch tall."""
-    analysis = make_analysis(3)
-    analysis = replace(analysis, ratio_image=np.zeros(shape))
-    figure = figures.overview(analysis, event_table(analysis))
-    figure.draw_without_rendering()
-    axes = figure.axes[0]
-    assert axes.get_title() == said
-    wide, tall = (float(size) for size in axes.get_window_extent().size / figure.dpi)
-    assert min(wide, tall) > 0.8
-    (image,) = axes.images
-    assert image.get_extent() == [-0.5, shape[1] - 0.5, shape[0] - 0.5, -0.5]
-    beside = figure.axes[1].get_window_extent().height / figure.dpi
-    assert beside < 2 * tall  # the scale of contrast
+@pytest.mark.parametrize("shape", [(64, 64), (128, 512), (20, 1000), (1000, 20)])
+def test_no_field_is_drawn_as_a_line(shape: tuple[int, int]) -> None:
+    analysis = replace(make_analysis(3), ratio_image=np.zeros(shape))
+    spec = movie_figures(analysis)["field"].specification
+    assert min(spec["width"], spec["height"]) >= 60
+    assert max(spec["width"], spec["height"]) <= PICTURE_PX
+    across = spec["layer"][1]["encoding"]["x"]["scale"]["domain"]
+    assert across == [-0.5, shape[1] - 0.5]
 
 
 def test_the_histogram_keeps_species_apart() -> None:
-    """A bin is two standard deviations wide, within reason."""
-    spread = np.full(30, 6.0)
-    assert 1000 / figures.histogram_bins(1000.0, spread) == pytest.approx(12, rel=0.01)
-    assert figures.histogram_bins(5.0, spread) == 10
-    assert figures.histogram_bins(1e5, spread) == 90
-    assert figures.histogram_bins(1000.0, np.array([])) == 10
+    """A bin is about two standard deviations wide, a round number, and holds every event."""
+    spread, far = np.full(30, 6.0), np.linspace(0.0, 1000.0, 30)
+    assert bin_width(far, spread) == 10.0
+    assert bin_width(far / 200, spread) == 1.0  # a sixth of all
+    assert bin_width(100 * far, spread) == 1000.0  # a ninetieth
+    assert bin_width(far, np.array([])) == 100.0
+    analysis = make_analysis(60)
+    bars = movie_figures(analysis)["masses"].data["bars"]
+    assert sum(bars["count"]) == len(counted(analysis.table)) < 60
+    assert set(bars["part"]) == {"ok", "flagged"}
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,11 @@
-"""Contrast against frame and ratiometric clips, as the page and the figures show them."""
+"""Contrast against frame and ratiometric clips, as the page shows them."""
 
 from __future__ import annotations
 
 import base64
 import io
+import json
 from dataclasses import replace
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -15,13 +15,8 @@ from report_factory import make_analysis, with_traces
 from iscat_analysis.fitting.run import packed, unpacked
 from iscat_analysis.notebook import Result
 from iscat_analysis.records import Clip, EventView, Trace
-from iscat_analysis.report.event_figures import (
-    CLIP_MS,
-    clip_shown,
-    event_details,
-    trace_svg,
-    trace_words,
-)
+from iscat_analysis.report.movie_figures import trace_data
+from iscat_analysis.report.pictures import CLIP_MS, Scale, clip_shown, event_details, trace_words
 from iscat_analysis.report.tables import event_table
 
 
@@ -32,50 +27,38 @@ def _trace(frames: int = 300, *, first: int = 100, turn: int = 250) -> Trace:
     return Trace(first, contrast, 1e-3, turn, 3, (turn - 80, turn + 60), 0.0, -0.004)
 
 
-def _parsed(trace: Trace) -> dict[str, list[ElementTree.Element]]:
-    """Sort what is drawn by its class; text without one."""
-    drawn: dict[str, list[ElementTree.Element]] = {}
-    for node in ElementTree.fromstring(trace_svg(trace)).iter():
-        drawn.setdefault(node.get("class", node.tag), []).append(node)
-    return drawn
-
-
 def test_the_step_is_drawn_where_it_was_fitted() -> None:
-    drawn = _parsed(_trace())
-    scale = {node.text: node for node in drawn["text"]}
-    zero, down = float(scale["0"].get("y", "")) - 4, float(scale["−4"].get("y", "")) - 4
-    left, right = float(scale["150"].get("x", "")), float(scale["350"].get("x", ""))
-    per_frame = (right - left) / 200
-    path = drawn["step"][0].get("d", "")
-    numbers = path[1:].replace("H", " ").replace("V", " ").split()
-    begin, before, turn, after, end = map(float, numbers)
-    assert before == pytest.approx(zero, abs=0.11)
-    assert after == pytest.approx(down, abs=0.11)
-    for x, frame in ((begin, 170), (turn, 250), (end, 310)):
-        assert x == pytest.approx(left + (frame - 150) * per_frame, abs=0.2)
-    when = drawn["when"][0]
-    assert float(when.get("width", "")) == pytest.approx(6 * per_frame, abs=0.2)
+    step = trace_data(_trace())["step"]
+    assert step["frame"] == [170, 250, 250, 310]
+    assert step["contrast"] == [0.0, 0.0, -4.0, -4.0]
 
 
 def test_frames_that_were_left_out_interrupt_the_curve_and_means_stay_on_one_side() -> None:
     trace = replace(_trace(), contrast=np.where(np.arange(300) < 150, 0.0, -0.004))
     trace.contrast[10:13] = np.nan
-    drawn = _parsed(trace)
-    assert drawn["frames"][0].get("d", "").count("M") == 2
-    marks = drawn["means"][0].get("d", "")[1:].split("M")
-    dots = [tuple(map(float, mark.split("h")[0].split())) for mark in marks]
-    assert len({y for _, y in dots}) == 2
-    assert [y for x, y in dots if x < 150] == [dots[0][1]] * sum(x < 150 for x, _ in dots)
+    drawn = trace_data(trace)
+    assert [k for k, value in enumerate(drawn["frames"]["contrast"]) if value is None] == [
+        10,
+        11,
+        12,
+    ]
+    means = list(zip(drawn["means"]["frame"], drawn["means"]["contrast"], strict=True))
+    assert {level for frame, level in means if frame < 250} == {0.0}
+    assert {level for frame, level in means if frame > 250} == {-4.0}
 
 
 @pytest.mark.parametrize("frames", [1, 2, 5, 600])
 def test_any_length_can_be_drawn(frames: int) -> None:
     trace = Trace(0, np.full(frames, np.nan), 1e-3, 0, 0, (0, frames), 0.0, 0.0)
-    assert "frames" in _parsed(trace)
+    assert trace_data(trace)["frames"]["contrast"] == [None] * frames
     known = replace(trace, contrast=np.linspace(-1, 1, frames))
-    assert "nan" not in trace_svg(known).lower()
+    assert None not in trace_data(known)["frames"]["contrast"]
     assert "±" not in trace_words(known)
     assert "frame 250 ± 3" in trace_words(_trace())
+
+
+def opened(address: str) -> Image.Image:
+    return Image.open(io.BytesIO(base64.b64decode(address.removeprefix("data:image/png;base64,"))))
 
 
 def test_a_clip_is_a_small_film() -> None:
@@ -83,15 +66,14 @@ def test_a_clip_is_a_small_film() -> None:
     images = rng.normal(0, 1e-3, (13, 18, 21)).astype(np.float32)
     images[:, 3, 4] = np.nan
     images[:, 0, 0] = np.linspace(-1, 1, 13)
-    film, words = clip_shown(Clip(tuple(range(40, 53)), 80, images), -3e-3, 3e-3, 46)
-    assert len(film) < 15_000
-    assert "80 frames over the 80 before them, from frame 40 on to 52" in words
-    shown = ElementTree.fromstring(str(film).replace("></div>", "/></div>"))
-    assert shown.get("style") == "aspect-ratio:21/18"
-    assert f"{13 * CLIP_MS}ms steps(13)" in shown[0].get("style", "")
-    assert "--still:-46.15%" in shown[0].get("style", "")
-    packed = shown[0].get("src", "").removeprefix("data:image/png;base64,")
-    with Image.open(io.BytesIO(base64.b64decode(packed))) as below_each_other:
+    scale = Scale(-3e-3, 3e-3, 4.0, "contrast")
+    film = clip_shown(Clip(tuple(range(40, 53)), 80, images), scale, 46)
+    assert len(film["image"]) < 15_000
+    assert "80 frames over the 80 before them, from frame 40 on to 52" in film["told"]
+    assert film["ratio"] == 21 / 18
+    assert (film["frames"], film["still"]) == (13, 6)
+    assert film["seconds"] == pytest.approx(13 * CLIP_MS / 1e3)
+    with opened(film["image"]) as below_each_other:
         pixels = np.asarray(below_each_other.convert("RGBA")).reshape(13, 18, 21, 4)
     assert pixels[:, 0, 0, 0].tolist() == [0] * 6 + [pixels[6, 0, 0, 0]] + [255] * 6
     assert np.all(pixels[:, 3, 4, 3] == 0)  # no number: transparent
@@ -123,13 +105,10 @@ def test_the_page_holds_trace_and_clip_and_a_figure_the_trace() -> None:
     plain = make_analysis(3)
     table = event_table(plain)
     bare, full = (event_details(one, table) for one in (plain, with_traces(plain)))
-    assert [(d.trace, d.words, d.clip, d.sliding) for d in bare.values()] == [("",) * 4] * 3
+    assert all(set(detail) == {"strip", "scales"} for detail in bare.values())
     for detail in full.values():
-        assert detail.trace.startswith('<svg class="trace"')
-        assert detail.clip.startswith('<div class="clip"')
-        assert sum(map(len, detail)) < 15_000
-    heights = [Result(one).view(0).get_size_inches()[1] for one in (plain, with_traces(plain))]
-    assert heights[1] > heights[0] + 1
+        assert {"trace", "told", "clip"} < set(detail)
+        assert len(json.dumps(detail)) < 25_000
     labels = {axes.get_xlabel() for axes in Result(with_traces(plain)).view(0).axes}
     assert "frame" in labels
 
@@ -141,7 +120,7 @@ def test_images_keep_their_shades() -> None:
     view = EventView(0, 0, 0, ramp, ramp, 4 * ramp)
     analysis = replace(make_analysis(1), views=(view,))
     (detail,) = event_details(analysis, event_table(analysis)).values()
-    with Image.open(io.BytesIO(base64.b64decode(detail.images))) as picture:
+    with opened(detail["strip"]) as picture:
         pixels = np.asarray(picture.convert("RGBA"))
     assert pixels.shape == (4, 3 * 64 + 4, 4)
     grey = pixels[1, :64]

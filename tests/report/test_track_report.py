@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import re
+import base64
+import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,8 +17,11 @@ from walkers import EXPOSURE_MS, RATE_HZ, fits_of, walk
 from iscat_analysis.findings.results import NOT_A_MASS
 from iscat_analysis.notebook import Result
 from iscat_analysis.records import FREE_PARAMETERS, TRACK_COLUMNS, free_parameters
-from iscat_analysis.report import event_figures, render_report, track_figures, write_report
+from iscat_analysis.report import pictures, render_report, write_report
 from iscat_analysis.report.answer import headline
+from iscat_analysis.report.movie_figures import mean_squared_displacement, movie_figures
+from iscat_analysis.report.pictures import films_shown
+from iscat_analysis.report.vega import figures_in
 
 
 def test_a_page_of_tracks_shows_paths_masses_speeds_and_films(tmp_path: Path) -> None:
@@ -25,18 +29,20 @@ def test_a_page_of_tracks_shows_paths_masses_speeds_and_films(tmp_path: Path) ->
     assert analysis.tracks is not None
     out = write_report(analysis, tmp_path / "out")
     page = (out / "report.html").read_text(encoding="utf-8")
-    drawn = {path.stem for path in (out / "figures").iterdir()}
-    assert {"overview", "mass_d", "distributions", "msd", "track_0000"} <= drawn
-    assert page.count('<tr id="row-') == len(analysis.tracks) == 10
+    figures = figures_in(out / "report.html")
+    assert {"masses", "field", "mobility", "msd"} <= set(figures)
+    assert figures["field"].name == "paths"
+    assert len(figures["masses"].data["bars"]["low"]) > 1
+    assert figures["mobility"].data["events"]["event"] == analysis.tracks["track"].tolist()
+    assert len(analysis.tracks) == 10
     assert page.count("data:image/webp;base64,") == len(analysis.films) == 2
     assert "because it is &lt;b&gt;long" in page
-    with Image.open(out / "figures" / "track_0000.webp") as film:
-        assert film.n_frames == 6
-        assert film.info["loop"] == 0
-        assert film.size == (3 * 24 + 2 * 2, 24)
-    for gid in re.findall(r'id="\w+-rows-([\d_]+)"', page):
-        assert all(int(row) < 10 for row in gid.split("_"))
-    assert f"{len(analysis.tracks)} tracks of 100 fitted positions" in page
+    film = next(films_shown(analysis))
+    content = base64.b64decode(film["film"].removeprefix("data:image/webp;base64,"))
+    with Image.open(io.BytesIO(content)) as moving:
+        assert moving.n_frames == 6
+        assert moving.info["loop"] == 0
+        assert moving.size == (3 * 24 + 2 * 2, 24)
     written = pd.read_csv(out / "tracks.csv")
     assert list(written.columns) == list(TRACK_COLUMNS)
 
@@ -44,7 +50,7 @@ def test_a_page_of_tracks_shows_paths_masses_speeds_and_films(tmp_path: Path) ->
 def test_spheres_lie_on_lines_of_constant_index() -> None:
     """The configured one runs through spheres whose two diameters are equal."""
     analysis = make_analysis(40, "track")
-    assert not track_figures.has_plane(analysis)
+    assert "sizes" not in movie_figures(analysis)
     assert analysis.tracks is not None
     sizes = np.linspace(60.0, 180.0, len(analysis.tracks))
     errors = {"sigma_diameter_nm": 5.0, "sigma_optical_diameter_nm": 1.0}
@@ -52,21 +58,19 @@ def test_spheres_lie_on_lines_of_constant_index() -> None:
     toml = 'fit.mode = "track"\nbackground.frames = [0, 9]\nparticle.model = "mie"\n'
     toml += 'particle.kind = "silica"\n'
     spheres = replace(analysis, tracks=tracks, config_toml=toml)
-    assert track_figures.has_plane(spheres)
-    (axes,) = track_figures.size_plane(spheres).axes
-    lines = [line for line in axes.lines if len(line.get_xdata()) == 200]
-    own = np.asarray(lines[-1].get_xydata(), dtype=float)
-    dots = [np.asarray(line.get_xydata()) for line in axes.lines if line.get_marker() == "o"]
-    found = np.concatenate(dots)
-    assert len(found) == len(sizes)
-    assert np.abs(np.interp(found[:, 0], *own.T) - found[:, 1]).max() < 0.05
+    data = movie_figures(spheres)["sizes"].data
+    lines, dots = (pd.DataFrame(data[name]) for name in ("materials", "spheres"))
+    own = lines[lines["own"]]
+    assert len(dots) == len(sizes)
+    off = np.interp(dots["diameter"], own["diameter"], own["length"]) - dots["length"]
+    assert np.abs(off).max() < 0.05
 
 
 def test_films_that_would_fill_the_page_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     analysis = make_analysis(40, "track")
-    assert len(list(event_figures.films_shown(analysis))) == 2
-    monkeypatch.setattr(event_figures, "FILM_BYTES", 9000)
-    assert len(list(event_figures.films_shown(analysis))) == 1
+    assert len(list(pictures.films_shown(analysis))) == 2
+    monkeypatch.setattr(pictures, "FILM_BYTES", 9000)
+    assert len(list(pictures.films_shown(analysis))) == 1
 
 
 def test_the_line_through_a_mean_squared_displacement_is_the_one_expected() -> None:
@@ -74,7 +78,7 @@ def test_the_line_through_a_mean_squared_displacement_is_the_one_expected() -> N
     rng, lags_of = np.random.default_rng(3), []
     for _ in range(200):
         path = fits_of([walk(rng, 80, 0.3)], rng, sigma_nm=20.0)
-        lags, measured, error = track_figures.mean_squared_displacement(path)
+        lags, measured, error = mean_squared_displacement(path)
         predicted = 4 * 0.3e6 * (lags / RATE_HZ - EXPOSURE_MS / 3e3) + error
         lags_of.append(measured / predicted)
     ratios = np.array(lags_of)
@@ -87,13 +91,13 @@ def test_a_headline_of_tracks_that_are_flagged_has_no_median() -> None:
     assert analysis.tracks is not None
     tracks = analysis.tracks.assign(status="ok", flags="")
     said = headline(replace(analysis, tracks=tracks), analysis.table)
-    assert "Over tracks: median mass" in said[0]
+    assert "Over tracks: mass 6" in said[0]
     tracks.loc[:4, ["status", "flags"]] = "not_free"
     said = headline(replace(analysis, tracks=tracks), analysis.table)
     assert "5 of 20 that are long enough are flagged" in said[0]
-    assert "median mass" not in said[0]
+    assert "mass 6" not in said[0]
     tracks.loc[:4, ["status", "flags"]] = "few_frames"
-    assert "median mass" in headline(replace(analysis, tracks=tracks), analysis.table)[0]
+    assert "mass 6" in headline(replace(analysis, tracks=tracks), analysis.table)[0]
     bare = replace(analysis, tracks=tracks, summary={**analysis.summary, "mass_scale": "absolute"})
     said = headline(bare, analysis.table)
     assert f"{NOT_A_MASS().text}." in said
@@ -101,23 +105,6 @@ def test_a_headline_of_tracks_that_are_flagged_has_no_median() -> None:
     assert "kDa" not in said[0]
 
 
-def test_the_colours_of_paths_cover_all_that_are_drawn() -> None:
-    """Beyond those that are ok too, but for what is so far from them that they had one colour."""
-    analysis = make_analysis(40, "track")
-    assert analysis.tracks is not None
-    tracks = analysis.tracks.assign(status="ok", mass_kda=[399.8, 400.3, 401.2, 196.0])
-    tracks.loc[3, "status"] = "not_free"
-    scale, _, beyond = track_figures.path_colors(replace(analysis, tracks=tracks))
-    assert (scale.vmin, scale.vmax, beyond) == (196.0, 401.2, "neither")
-    tracks.loc[3, "mass_kda"] = 9e3
-    scale, _, beyond = track_figures.path_colors(replace(analysis, tracks=tracks))
-    assert (scale.vmin, beyond) == (399.8, "max")
-    assert scale.vmax == pytest.approx(3 * 401.2)
-    drawn = track_figures.trajectories(replace(analysis, tracks=tracks), analysis.table)
-    assert drawn.axes[-1].get_ylabel().startswith("mass")
-
-
-@pytest.mark.usefixtures("sketched")
 def test_a_height_that_was_held_fixed_is_in_no_table_of_precision() -> None:
     analysis = make_analysis(40, "track")
     assert free_parameters("track", analysis.table) == FREE_PARAMETERS["joint"]
