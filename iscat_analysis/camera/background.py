@@ -205,8 +205,7 @@ def smooth_background(
     spread = uniform_filter(apart**2, _NEIGHBOURHOOD, mode="nearest") / share
     noise = np.maximum(mean, 0.0) + variance_e2
     structure = np.clip(1 - 2 * noise / np.maximum(spread, 1e-300), 0.0, 1.0)
-    smooth: FloatArray = np.maximum(mean + structure * apart, 0.0)
-    return smooth
+    return np.asarray(np.maximum(mean + structure * apart, 0.0))
 
 
 def _check_ranges(

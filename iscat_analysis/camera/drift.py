@@ -65,8 +65,7 @@ class Trajectory:
             return np.broadcast_to(self.shift_px[0], (*at.shape, 2)).copy()
         k = np.clip(np.searchsorted(known, at) - 1, 0, known.size - 2)
         share = ((at - known[k]) / (known[k + 1] - known[k]))[..., None]
-        between: FloatArray = (1 - share) * self.shift_px[k] + share * self.shift_px[k + 1]
-        return between
+        return np.asarray((1 - share) * self.shift_px[k] + share * self.shift_px[k + 1])
 
 
 def follow_pattern(
@@ -196,14 +195,12 @@ class Mover:
         """Spectrum of an image, shape (v, u)."""
         more_y, more_x = np.subtract(self._size, self._shape).tolist()
         wide = _continued(image.T, more_x).T
-        spectrum: ComplexArray = fft.rfft2(_continued(wide, more_y))
-        return spectrum
+        return np.asarray(fft.rfft2(_continued(wide, more_y)))
 
     def image(self, spectrum: ComplexArray) -> FloatArray:
         """Image of a spectrum, shape (y, x)."""
         rows, columns = self._shape
-        image: FloatArray = fft.irfft2(spectrum, s=self._size)[:rows, :columns]
-        return image
+        return np.asarray(fft.irfft2(spectrum, s=self._size)[:rows, :columns])
 
     def transfer(self, shift_px: FloatArray, weights: FloatArray) -> ComplexArray:
         """Factors that make a spectrum that of a weighted sum of shifted images.
@@ -212,8 +209,7 @@ class Mover:
         """
         y = np.exp(-2j * np.pi * shift_px[:, :1] * self._fy) * weights[:, None]
         x = np.exp(-2j * np.pi * shift_px[:, 1:] * self._fx)
-        transfer: ComplexArray = np.einsum("kv,ku->vu", y, x)
-        return transfer
+        return np.asarray(np.einsum("kv,ku->vu", y, x))
 
 
 def derivatives(image: FloatArray) -> FloatArray:
@@ -235,8 +231,7 @@ def trusted(usable: BoolArray, moved_px: float = 0.0) -> BoolArray:
     border = REACH_PX + math.ceil(moved_px - _SETTLED_PX)
     inside = np.zeros_like(usable)
     inside[border:-border, border:-border] = True
-    kept: BoolArray = inside & ~near
-    return kept
+    return np.asarray(inside & ~near)
 
 
 def filling(usable: BoolArray) -> tuple[FloatArray, ...]:

@@ -101,8 +101,7 @@ def _finite(frames: NDArray[Any]) -> NDArray[Any]:
 
     Shapes: `frames` and result (t, y, x).
     """
-    whole: NDArray[Any] = frames[np.isfinite(frames).all(axis=(1, 2))]
-    return whole
+    return np.asarray(frames[np.isfinite(frames).all(axis=(1, 2))])
 
 
 def _is_dark(dark: NDArray[Any], lit: NDArray[Any]) -> bool:

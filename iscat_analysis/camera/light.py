@@ -310,8 +310,7 @@ class LightModel:
         if full.any():
             limit = camera.full_scale_adu
             steady[full] = counts[full] if limit is None else limit
-        out: NDArray[Any] = steady.astype(float_type(counts.dtype))
-        return out
+        return np.asarray(steady.astype(float_type(counts.dtype)))
 
     def taken(self, signal: FloatArray) -> FloatArray:
         """Give the change of the divisor that a signal makes.

@@ -372,8 +372,7 @@ class NoiseSpectrum:
         spectrum = fft.rfft2(np.pad(in_noise, MARGIN_PX, mode="symmetric"))
         spectrum /= self.power.astype(weighted.dtype)
         whitened = fft.irfft2(spectrum, s=self.shape)[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
-        out: NDArray[Any] = root * whitened
-        return out
+        return np.asarray(root * whitened)
 
     def dual(self, template: FloatArray) -> FloatArray:
         """Give what an image's product with a template is, to the noise, as a product of numbers.
