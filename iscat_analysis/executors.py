@@ -104,8 +104,7 @@ class DaskExecutor(Executor):
                 found = versions()
             except ImportError:
                 found = {"iscat-analysis": "missing"}
-            memory = dask_worker.memory_manager.memory_limit
-            return {"versions": found, "memory": memory or 0}
+            return {"versions": found, "memory": dask_worker.memory_manager.memory_limit or 0}
 
         for worker, found in self._client.run(look).items():
             _compare(self._versions, found["versions"], worker)

@@ -492,8 +492,7 @@ def _largest_neighbour(values: FloatArray) -> FloatArray:
 def _neighbours(values: FloatArray) -> tuple[tuple[FloatArray, ...], ...]:
     """Both neighbours of every pixel along y, and along x; at an edge twice the inner one."""
     padded = np.pad(values, 1, mode="reflect")
-    along_y = padded[:-2, 1:-1], padded[2:, 1:-1]
-    return along_y, (padded[1:-1, :-2], padded[1:-1, 2:])
+    return (padded[:-2, 1:-1], padded[2:, 1:-1]), (padded[1:-1, :-2], padded[1:-1, 2:])
 
 
 class _Scatter:

@@ -330,8 +330,7 @@ def metamorph_hints(settings: object, planes: object) -> Hints:
     x_nm, y_nm = (positive(said.get(f"{axis}Calibration"), unit) if unit else None for axis in "XY")
     days, ms = (np.asarray(times.get(name, ()), float) for name in ("DateCreated", "TimeCreated"))
     rate, ticks = measure_clock(dict(enumerate((86_400 * (days - days[:1]) + ms / 1e3).tolist())))
-    known = StackMetadata(x_nm, frame_rate_hz=rate, ticks=ticks, source="metamorph")
-    return Hints(known, y_nm)
+    return Hints(StackMetadata(x_nm, frame_rate_hz=rate, ticks=ticks, source="metamorph"), y_nm)
 
 
 def plain_hints(resolution: Resolution | None) -> Hints:

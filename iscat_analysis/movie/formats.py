@@ -84,8 +84,7 @@ class ReaderFrames:
                 f"{path}: holds {shape[0]} frame of {shape[1]} x {shape[2]} pixels; a movie needs "
                 "frames before and after a particle binds"
             )
-        size = math.prod(shape) * dtype.itemsize
-        refuse_growth(size, path.stat().st_size, f"{path}: it")
+        refuse_growth(math.prod(shape) * dtype.itemsize, path.stat().st_size, f"{path}: it")
         self._path, self._frame, self._close = path, frame, close
         self.shape, self.dtype = shape, dtype.newbyteorder("=")
         self.metadata = merge([hints], path)

@@ -107,8 +107,7 @@ def _refuse_incomplete(array: Any, shape: tuple[int, ...], store: CheckedStore, 
     """Refuse an array that declares more than its folder holds, or lacks a chunk."""
     dtype = np.dtype(array.dtype)
     refuse_large_chunks(array.chunks, dtype, f"{name}: it")
-    size = math.prod(shape) * dtype.itemsize
-    refuse_growth(size, sum(store.sizes.values()), f"{name}: it")
+    refuse_growth(math.prod(shape) * dtype.itemsize, sum(store.sizes.values()), f"{name}: it")
     stored = array.shards or array.chunks
     grid = [-(-n // c) for n, c in zip(shape, stored, strict=True)]
     prefix = f"{array.path}/" if array.path else ""

@@ -115,8 +115,7 @@ class ArrayFrames:
         self.shape = shape_of_frames(tuple(int(n) for n in array.shape), stored, name)
         self.dtype = stored.newbyteorder("=")
         self.metadata, self.notes = metadata, notes
-        depth = getattr(array, "depth", 1)
-        self.read = in_slabs(self._decoded, self.shape, self.dtype, depth)
+        self.read = in_slabs(self._decoded, self.shape, self.dtype, getattr(array, "depth", 1))
 
     def _decoded(self, start: int, stop: int) -> NDArray[Any]:
         return np.array(self._array[start:stop], dtype=self.dtype, order="C")

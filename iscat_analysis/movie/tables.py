@@ -421,8 +421,7 @@ def _file_of(path: Path) -> Path:
     """Give the table in an output folder, or the file itself."""
     if not is_folder(path):
         return path
-    files = (path / name for name in ("fits.parquet", "fits.csv"))
-    inside = next(filter(is_file, files), None)
+    inside = next(filter(is_file, (path / name for name in ("fits.parquet", "fits.csv"))), None)
     if inside is None:
         raise DataError(
             f"{path}: is a folder without fits.csv; give an output folder of iscat fit, or the "
@@ -610,8 +609,7 @@ def _from_text(path: Path) -> pd.DataFrame:
     if unit is not None:
         factors["mass_kda"] = unit
     whole = ["mass_kda"] if factors.get("mass_kda") == _KDA["da"] else []
-    numbers = [name for name in cells.columns if name not in TEXTS]
-    columns, notes = cells.numbers(numbers, whole)
+    columns, notes = cells.numbers([name for name in cells.columns if name not in TEXTS], whole)
     texts = {
         name: np.array([cell.strip() for cell in cells.columns[name]], dtype=object)
         for name in TEXTS

@@ -287,8 +287,7 @@ class TiffFrames:
         size = math.prod(self.shape[1:]) * self.dtype.itemsize
         if np.any(np.diff(self._starts[start:stop]) != size):
             return None
-        first = int(self._starts[start])
-        return frames_in_place(self.path, self.data, first, shape, self.stored)
+        return frames_in_place(self.path, self.data, int(self._starts[start]), shape, self.stored)
 
     def close(self) -> None:
         """Release the file."""

@@ -189,8 +189,7 @@ class MeasuredField:
 
     def lens(self, rho: float) -> LatticeLens:
         """How the kernels make a signal of a profile, with the reference ρ."""
-        step = self.template.step_nm
-        return LatticeLens(1 / step, rho, self.half, 1, window()[0])
+        return LatticeLens(1 / self.template.step_nm, rho, self.half, 1, window()[0])
 
     def profile(self, _z_nm: float, orders: int) -> FloatArray:
         """Profile at any height, shape (2·orders, nodes, nodes)."""
@@ -525,8 +524,7 @@ def field_of(
     source, axial = _source(opening, factor, oil_nm)
     transverse = _in_fours(opening.pupil.transverse, "edge")
     step = STEP / (opening.wavenumber * optics.na)
-    intervals = math.ceil(reach_nm / step) + 1
-    table = _bessel_table(transverse, step, intervals)
+    table = _bessel_table(transverse, step, math.ceil(reach_nm / step) + 1)
     return RadialField(
         source, axial, transverse, table, step, math.radians(optics.polarization_deg),
         optics.polarization == "circular", optics.analyzer,
