@@ -453,7 +453,7 @@ def find_unsteady(
     if lit.mean() < 0.5:
         return None
     variance = np.where(lit, light + camera.read_variance_e2(light.shape), np.inf)
-    fast, slow = _Scatter(shape), _Scatter(shape)
+    fast, slow = np.zeros((2, 3, *shape))
     found = lit & still
     for block in blocks:
         electrons = camera.to_electrons(block)
@@ -463,16 +463,16 @@ def find_unsteady(
         steady = electrons / power[:, None, None]
         mean = steady.mean(axis=0)
         for frame in steady:
-            fast.add(frame - mean)
-        slow.add((mean - light) * np.sqrt(len(block)))
+            fast += _products(frame - mean)
+        slow += _products((mean - light) * np.sqrt(len(block)))
     for scatter, number in ((fast, freedom[0]), (slow, freedom[1])):
-        ratio = np.where(lit, scatter.squares / variance / number, 0.0)
+        ratio = np.where(lit, scatter[0] / variance / number, 0.0)
         usual = float(np.median(ratio[lit]))
         if scatter is slow and usual > 3.0:  # by the light or the stage, and in what pattern
             continue
         limit = chdtri(number, 1e-9) / number  # by chance
         more = ratio > usual * limit
-        more &= scatter.products.max(axis=0) < least_beside * scatter.squares
+        more &= scatter[1:].max(axis=0) < least_beside * scatter[0]
         more &= _largest_neighbour(ratio) - usual < least_beside * (ratio - usual)
         if more.any():  # by those around as well, which takes longest
             more &= ratio > median_filter(ratio, _AROUND, mode="nearest") * limit
@@ -495,18 +495,13 @@ def _neighbours(values: FloatArray) -> tuple[tuple[FloatArray, ...], ...]:
     return (padded[:-2, 1:-1], padded[2:, 1:-1]), (padded[1:-1, :-2], padded[1:-1, 2:])
 
 
-class _Scatter:
-    """Mean square deviations of pixels, and their products with neighbouring pixels."""
+def _products(image: FloatArray) -> FloatArray:
+    """Squares of an image, and its products with what is beside it along y and along x.
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        self.squares = np.zeros(shape)
-        self.products = np.zeros((2, *shape))
-
-    def add(self, image: FloatArray) -> None:
-        """Add one image."""
-        self.squares += image**2
-        for products, (one, other) in zip(self.products, _neighbours(image), strict=True):
-            products += image * (one + other) / 2
+    Shapes: `image` (y, x), result (3, y, x).
+    """
+    beside = (image * (one + other) / 2 for one, other in _neighbours(image))
+    return np.stack([image**2, *beside])
 
 
 def _noisy_lines(ratio: FloatArray, lit: BoolArray, usual: float, least_beside: float) -> BoolArray:

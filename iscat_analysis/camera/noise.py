@@ -482,8 +482,7 @@ def measure_spectrum(
     total, number = np.zeros((rows, columns // 2 + 1)), 0
     for found in map(change, starts.tolist()):
         if found is not None and found[2] <= most:
-            waves = fft.rfft2(np.clip(found[0], -found[1], found[1], out=found[0]))
-            total += np.square(waves.real) + np.square(waves.imag)
+            total += _periodogram(*found[:2])
             number += 1
     if not number:
         return None
@@ -677,5 +676,10 @@ def _spectrum(
     # shot noise over the light: alike in all frames, whatever the laser does
     change *= math.sqrt(2 / (1 / powers[0] + 1 / powers[1]))
     limit = 5.0 * robust_sigma(change[used])  # a change beyond is no noise
-    waves = fft.rfft2(np.clip(change, -limit, limit))
+    return _periodogram(change, limit)
+
+
+def _periodogram(change: NDArray[Any], limit: float) -> NDArray[Any]:
+    """Give the power of a change at every spatial frequency, without what is beyond noise."""
+    waves = fft.rfft2(np.clip(change, -limit, limit, out=change))
     return np.asarray(np.square(waves.real) + np.square(waves.imag))
