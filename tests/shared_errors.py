@@ -7,7 +7,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
-from iscat_analysis.optics.scale import MassScale
+from iscat_analysis.optics.model import MassScale
 from iscat_analysis.trust.systematic import contributions, total
 
 

@@ -25,10 +25,10 @@ from typing import Literal
 import numpy as np
 
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.optics.aperture import Aperture, aperture
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.scatterers import Rod
 from iscat_analysis.optics.sized import MASS_STEP, SizedModel
+from iscat_analysis.optics.waves import Aperture, aperture
 from iscat_analysis.records import ComplexArray, FloatArray
 
 Measure = Literal["exact", "dong2021"]

@@ -3,7 +3,7 @@
 The optics of the standards, which a mass calibration stores.
 
 Contrast per mass depends on the optics with which it was measured.  A calibration that stores them
-can be used for movies with other optics too, because the model converts it (`optics.scale`).
+can be used for movies with other optics too, because the model converts it (`MassScale`).
 
 Where a mass line meets a table of events: its contrasts become masses, and the errors follow.
 """

@@ -22,7 +22,7 @@ from iscat_analysis.inference.cause import likely_cause
 from iscat_analysis.inference.fit import OUTWARD
 from iscat_analysis.medians import robust_sigma
 from iscat_analysis.movie import Stack
-from iscat_analysis.optics.scale import MassScale
+from iscat_analysis.optics.model import MassScale
 from iscat_analysis.optics.scatterers import has_shells
 from iscat_analysis.optics.sized import VESICLE
 from iscat_analysis.records import FloatArray, Status, Windows, has_flag

@@ -20,20 +20,29 @@ from iscat_analysis._kernels.radial import STEP
 from iscat_analysis.config import Calibration, Config, Optics, Particle
 from iscat_analysis.errors import ConfigError, ContrastError
 from iscat_analysis.last_used import memoize
-from iscat_analysis.optics.aperture import (
-    Aperture,
-    aperture,
-    aperture_on,
-    critical_angle,
-    is_coherent,
-    spectrum,
+from iscat_analysis.optics.model import (
+    ForwardModel,
+    MassScale,
+    carry_refusal,
+    collected_area_nm2,
+    wiggled,
 )
-from iscat_analysis.optics.model import ForwardModel, collected_area_nm2, wiggled
 from iscat_analysis.optics.pixels import PixelArea, PixelGrid
-from iscat_analysis.optics.scale import MassScale, carry_refusal
 from iscat_analysis.optics.scatterers import Rod, Sphere, material, rod_of, sphere_of
 from iscat_analysis.optics.sized import sized
-from iscat_analysis.optics.waves import MeasuredField, Template, check_table, field_of, sha256_of
+from iscat_analysis.optics.waves import (
+    Aperture,
+    MeasuredField,
+    Template,
+    aperture,
+    aperture_on,
+    check_table,
+    critical_angle,
+    field_of,
+    is_coherent,
+    sha256_of,
+    spectrum,
+)
 from iscat_analysis.units import KILODALTON_KG, NM
 
 PEAK_SEARCH_RADIUS = 4.0

@@ -29,12 +29,10 @@ from iscat_analysis._kernels.hessian import PAIRS
 from iscat_analysis.config import Optics, Particle, SphereKind
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.last_used import kept
-from iscat_analysis.optics.aperture import aperture_on
-from iscat_analysis.optics.model import ForwardModel, Values
+from iscat_analysis.optics.model import ForwardModel, MassScale, Values
 from iscat_analysis.optics.pixels import PixelGrid
-from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.optics.scatterers import SMALLEST_NM, Sphere, has_shells, material
-from iscat_analysis.optics.waves import with_light_of
+from iscat_analysis.optics.waves import aperture_on, with_light_of
 from iscat_analysis.records import ComplexArray, FloatArray
 from iscat_analysis.units import sphere_mass_kda
 

@@ -19,8 +19,7 @@ from iscat_analysis.inference.likelihood import LEVEL
 from iscat_analysis.inference.models import TurningRod
 from iscat_analysis.last_used import memoize
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.optics.model import collected_area_nm2, photons_per_intensity
-from iscat_analysis.optics.scale import MassScale
+from iscat_analysis.optics.model import MassScale, collected_area_nm2, photons_per_intensity
 from iscat_analysis.optics.scatterers import ANGLES, Rod
 from iscat_analysis.options import takes
 from iscat_analysis.pieces.counts import (

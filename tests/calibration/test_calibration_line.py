@@ -15,7 +15,7 @@ from iscat_analysis.diagnosis import sign_warning
 from iscat_analysis.findings import Finding
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.optics.scale import MassScale
+from iscat_analysis.optics.model import MassScale
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.records import Analysis
 

@@ -14,7 +14,7 @@ import iscat_analysis as ia
 from iscat_analysis.config import Uncertainty, configure
 from iscat_analysis.diagnosis import nonlinearity_warning
 from iscat_analysis.optics.forward import forward_model
-from iscat_analysis.optics.scale import MassScale
+from iscat_analysis.optics.model import MassScale
 
 GRADIENT = -3.1e-5
 INSTRUMENT = Instrument(emission="reciprocal")
