@@ -86,18 +86,17 @@ class Camera:
                 full |= self.to_electrons(counts) >= self.well_depth_e
         return full
 
-    def steady(self, counts: NDArray[Any]) -> tuple[FloatArray, FloatArray] | None:
-        """Give photoelectrons of frames of one power, and what the powers were; None of the dark.
+    def steady(self, counts: NDArray[Any]) -> FloatArray | None:
+        """Give photoelectrons of frames as if all had one power; None of the dark.
 
-        Shapes: `counts` (t, ...), results (t, ...) and (t,), of mean 1.
+        Shapes: `counts` and result (t, ...).
         """
         electrons = self.to_electrons(counts)
         power = electrons.mean(axis=tuple(range(1, counts.ndim)))
         if power.min(initial=math.inf) <= 0:
             return None
-        power /= power.mean()
-        electrons /= power.reshape(-1, *[1] * (counts.ndim - 1))
-        return electrons, power
+        electrons /= (power / power.mean()).reshape(-1, *[1] * (counts.ndim - 1))
+        return electrons
 
     def usable(self, counts: NDArray[Any], masked: BoolArray | None) -> BoolArray:
         """Find the pixels that no frame has saturated, and that are not masked.
@@ -447,10 +446,9 @@ class FieldSample:
 
         Shapes: `counts` (t, 256, 256), `camera` that of the squares.
         """
-        steady = camera.steady(counts)
-        if steady is None:
+        electrons = camera.steady(counts)
+        if electrons is None:
             return math.nan, math.nan
-        electrons, _ = steady
         noise = np.square(np.diff(electrons, axis=0)).mean(axis=0) / 2
         light = electrons.mean(axis=0) + camera.read_variance_e2((_SIDE * _ALONG, _SIDE * _ALONG))
         each, expected = (

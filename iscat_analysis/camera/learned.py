@@ -506,10 +506,9 @@ def _gain_of_detail(counts: NDArray[Any], camera: Camera) -> tuple[float, float]
 
     Shapes: `counts` (t, y, x).
     """
-    steady = camera.steady(counts)
-    if steady is None:
+    light = camera.steady(counts)
+    if light is None:
         raise DataError("a frame is dark")
-    light, _ = steady
     mean, dark = light.mean(axis=0), camera.dark_variance_e2(counts)
     # 70: the sum of the squares of 1, −4, 6, −4, 1, the norm of both axes together
     scale = 70.0 * np.sqrt(2 * np.maximum(mean + dark, 1.0))

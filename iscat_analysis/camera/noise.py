@@ -72,10 +72,9 @@ def shared_light(
     theirs = camera.mapped(lambda image: image.reshape(-1)[places])
     values = counts.reshape(len(counts), -1)[:, places]
     lit = theirs.to_electrons(values.mean(axis=0)) > 0
-    steady = theirs.mapped(lambda image: image[lit]).steady(values[:, lit]) if lit.any() else None
-    if steady is None:
+    pixels = theirs.mapped(lambda image: image[lit]).steady(values[:, lit]) if lit.any() else None
+    if pixels is None:
         return None
-    pixels, _ = steady
     light = pixels.mean(axis=0)
     near, apart, far = (
         float(np.median(np.mean((pixels[lag:] - pixels[:-lag]) ** 2, axis=0) / light))
@@ -96,10 +95,9 @@ def averaged_noise(counts: NDArray[Any], camera: Camera) -> float | None:
 
     Shapes: `counts` (t, y, x).
     """
-    steady = camera.steady(counts[:_FRAMES])
-    if steady is None or shared_light(counts, camera) is None:
+    pixels = camera.steady(counts[:_FRAMES])
+    if pixels is None or shared_light(counts, camera) is None:
         return None
-    pixels, _ = steady
     squares = [float(np.mean((pixels[k:] - pixels[:-k]) ** 2)) for k in (*range(1, _APART), _FAR)]
     common = sum(1 - one / squares[-1] for one in squares[:-1])
     return squares[-1] / squares[0] * (1 + 2 * common)

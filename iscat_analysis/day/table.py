@@ -209,7 +209,7 @@ def _text(source: Path) -> str:
 
 
 def _from_csv(source: Path, text: str) -> Records:
-    _, delimiter, _ = table_lines(text.splitlines())
+    delimiter, _ = table_lines(text.splitlines())
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
     names: list[str] = []
     records: Records = []

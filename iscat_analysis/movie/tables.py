@@ -245,8 +245,8 @@ def refuse_twice(names: Sequence[object], used: Collection[str], table: object) 
             )
 
 
-def table_lines(lines: Iterable[str]) -> tuple[list[str], str, Iterable[str]]:
-    """Divide a table: its first lines, what separates their cells, and all lines from the heading.
+def table_lines(lines: Iterable[str]) -> tuple[str, Iterable[str]]:
+    """Tell what separates the cells of a table, and give its lines from the heading on.
 
     Empty lines and comments, which begin with ``#``, are left out; Excel's first line ``sep=;``
     says what separates.  The heading is the last comment where the first line is one of numbers.
@@ -261,7 +261,7 @@ def table_lines(lines: Iterable[str]) -> tuple[list[str], str, Iterable[str]]:
     if plain and first and all(map(_is_number, next(csv.reader(plain[:1], delimiter=between)))):
         plain.insert(0, head[first - 1].lstrip()[1:].lstrip())
     rest = (line for line in told if line.lstrip()[0] != "#")
-    return plain, between, chain(plain, rest)
+    return between, chain(plain, rest)
 
 
 def _read(
@@ -271,7 +271,7 @@ def _read(
     *,
     units: bool,
 ) -> Cells:
-    _, between, told = table_lines(lines)
+    between, told = table_lines(lines)
     rows = csv.reader(told, delimiter=between)
     names = [name.strip() for name in next(rows, [])]
     places = choose(names)
