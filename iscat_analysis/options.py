@@ -71,6 +71,11 @@ class EventOptions(TypedDict, total=False):
         "of the contrasts.",
         "--calibration LINE.toml",
     ]
+    select: Annotated[
+        "str | Path | None",
+        "Selection that the result page saved: events inside its gates, without those rejected.",
+        "--select FILE",
+    ]
 
 
 class CommonSpecies(EventOptions, total=False):

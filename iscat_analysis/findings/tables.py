@@ -17,6 +17,7 @@ MASSES_REPLACED = note(
     subject=Subject.SCALE,
 )
 REJECTED_BY_HAND = note("events-rejected-by-hand", "{amount} that somebody rejected left out")
+SELECTED = note("events-selected", "{amount} that the selection leaves out are not counted")
 NO_ERRORS = caution(
     "no-errors-of-events",
     "no event has an error of its own, so that the width of a species holds the errors",

@@ -348,7 +348,10 @@ TEXTS = ("status", "rejected_by_hand")
 _WORDS = ("mass", "masses", "molecular_mass", "molecular_weight", "mw", "masse", "massen")
 _KDA = {"kda": 1.0, "da": 1e-3, "mda": 1e3}
 _PER_KDA = {f"{word}_{unit}": each for unit, each in _KDA.items() for word in _WORDS}
-_OURS = "systematic_mass_kda systematic_contrast snr n_after p_value track status rejected_by_hand"
+_OURS = (
+    "event diameter_nm systematic_mass_kda systematic_contrast snr n_after p_value track status "
+    "rejected_by_hand"
+)
 _NAMES: Mapping[str, Mapping[str, float]] = {
     "frame": dict.fromkeys(("frame_indices", "frame", "frames", "frame_index"), 1.0),
     "x_px": {"x_coords": 1.0, "x_px": 1.0},

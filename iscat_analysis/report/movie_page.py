@@ -109,6 +109,7 @@ def page_context(analysis: Analysis, figures: Mapping[str, VegaFigure]) -> dict[
         "images": images,
         "kind": kind.noun,
         "movie": _movie_name(analysis),
+        "quantity": sample.quantity.label.strip("|"),
         "unit": sample.quantity.unit,
         "rows": len(sample.rows),
     }

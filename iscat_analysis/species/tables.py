@@ -20,22 +20,23 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Unpack
+from typing import Literal, Unpack
 
 import numpy as np
 import pandas as pd
 import scipy
+from pydantic import BaseModel
 from scipy.special import log_ndtr
 
 from iscat_analysis.calibration.line import mass_line, weighed
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings import tables as of
-from iscat_analysis.inference.checks import number_in
+from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie.tables import named, read_events, unit_note
 from iscat_analysis.options import EventOptions, only, takes
 from iscat_analysis.reading import read_json
-from iscat_analysis.records import FloatArray, species_rows
+from iscat_analysis.records import BoolArray, FloatArray, species_rows
 from iscat_analysis.species.events import POSSIBLE_KDA, Efficiency, Events, possible
 from iscat_analysis.units import count, listed
 
@@ -140,7 +141,7 @@ def event_table(
     the table has.
     """
     given = only(EventOptions, options)
-    line = given.pop("calibration")
+    line, selection = given.pop("calibration"), given.pop("select")
     sigma_kda, limit_kda, limit_sigma_kda, above_kda = (
         None if value is None else mass_in(f"`{option}`", value) for option, value in given.items()
     )
@@ -174,7 +175,11 @@ def event_table(
         )
     if "status" not in table and (doubt := unit_note(table["mass_kda"].to_numpy(float))):
         findings.append(of.AS_READ({"text": doubt}))
+    chosen = None if selection is None else _chosen(table, path_in("`select`", selection), called)
     table = _checked(table)
+    if chosen is not None:
+        findings.append(of.SELECTED({"amount": count(int((~chosen).sum()), "event")}))
+        table = table[chosen]
     found, efficiency = _usable(table, called, sigma_kda), None
     if above_kda is not None:
         kept = np.abs(found.mass_kda) > above_kda
@@ -194,6 +199,57 @@ def event_table(
         efficiency = _sharp(edge * (1 - 10 * _CUT_WIDTH))
     findings = [replace(finding, where=called) for finding in (*findings, *found.findings)]
     return replace(found, efficiency=efficiency, edge_kda=edge, findings=tuple(findings))
+
+
+class _Particle(BaseModel):
+    """A particle that somebody rejected on the result page."""
+
+    event: int
+    frame: int
+
+
+class _Selection(BaseModel):
+    """What the result page saves."""
+
+    quantity: Literal["mass", "contrast", "diameter", "optical diameter"]
+    gates: list[tuple[float, float]]
+    rejected: list[_Particle]
+
+
+_SELECTED = {
+    "mass": ("mass_kda", 1.0),
+    "contrast": ("contrast", 1e-3),
+    "diameter": ("diameter_nm", 1.0),
+    "optical diameter": ("optical_diameter_nm", 1.0),
+}
+"""Columns that gates are of, and their unit there."""
+
+
+def _chosen(table: pd.DataFrame, file: Path, called: str) -> BoolArray:
+    """Tell which rows a selection of the result page keeps."""
+    try:
+        selection = _Selection.model_validate(read_json(file))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{file}: is no selection of a result page ({error})") from None
+    column, unit = _SELECTED[selection.quantity]
+    numbers = {"event", "frame", column}
+    if missing := numbers - set(table):
+        raise DataError(
+            f"{called}: has no {', '.join(sorted(missing))}, which {file} selects by; give the "
+            "result whose page saved it"
+        )
+    values = table[column].abs().to_numpy(float)
+    kept = np.ones(len(table), dtype=bool)
+    if selection.gates:
+        kept = np.any([(values >= a * unit) & (values <= b * unit) for a, b in selection.gates], 0)
+    frames = dict(zip(table["event"], table["frame"], strict=True))
+    for particle in selection.rejected:
+        if frames.get(particle.event) != particle.frame:
+            raise DataError(
+                f"{file}: {called} has no event {particle.event} at frame {particle.frame}: the "
+                "selection is of another result"
+            )
+    return kept & ~table["event"].isin([one.event for one in selection.rejected]).to_numpy(bool)
 
 
 def filter_efficiency(

@@ -113,7 +113,7 @@
   // ---- gates and rejections, which `iscat species --select` reads
   byId("gate").addEventListener("click", () => { gates.push([Math.min(...interval), Math.max(...interval)]); refresh(); });
   byId("save-selection").addEventListener("click", () => {
-    const content = { movie: held.movie, quantity: held.figures.masses.usermeta.title, gates, rejected: events.filter((e) => rejected.has(e.event)).map(({ event, frame, x, y }) => ({ event, frame, x_px: x, y_px: y })) };
+    const content = { movie: held.movie, quantity: held.quantity, gates, rejected: events.filter((e) => rejected.has(e.event)).map(({ event, frame, x, y }) => ({ event, frame, x_px: x, y_px: y })) };
     const href = URL.createObjectURL(new Blob([`${JSON.stringify(content, null, 1)}\n`], { type: "application/json" }));
     made("a", { href, download: `${held.movie.replace(/\.[^.]*$/, "")}.selection.json` }).click();
   });
