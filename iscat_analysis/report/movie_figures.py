@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import norm
 
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.optics.scatterers import Sphere, material, scattering_length_nm, sphere_of
@@ -468,12 +467,11 @@ def _curves(sample: Sample) -> dict[str, list[Any]]:
         with np.errstate(divide="ignore"):
             model = np.array(found["model"]) / (sample.scale * power * mass ** (power - 1))
     typical = float(np.nanmedian(sample.values[1])) if len(sample.rows) else 0.0
-    parts = np.array(
-        [
-            each.count * norm.pdf(grid, each.value, math.hypot(each.width, typical) or 1e-9)
-            for each in sample.species
-        ]
-    )
+    centre, count, width = np.array([[s.value, s.count, s.width] for s in sample.species]).T[
+        ..., None
+    ]
+    spread = np.maximum(np.hypot(width, typical), 1e-9)
+    parts = count / spread * np.exp(-(((grid - centre) / spread) ** 2) / 2)
     whole = parts.sum(axis=0)
     shares = np.divide(parts, whole, out=np.zeros_like(parts), where=whole > 0)
     least = 1e-3 * float(np.nanmax(model))
