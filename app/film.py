@@ -21,7 +21,7 @@ from bokeh.models import (
 
 import iscat_analysis as ia
 from iscat_analysis.pipeline.preview import RatioFilm
-from iscat_analysis.report.figures import SHOWN_FRAMES
+from iscat_analysis.pipeline.stored import SHOWN_FRAMES
 from iscat_app.chosen import Chosen, Notice
 from iscat_app.widgets import BLUE, ORANGE, RED, YELLOW, Picture, plot, source
 

@@ -22,7 +22,8 @@ from iscat_cli.options import Command
 
 _MOVIES = (setup.init, fit.fit, day.batch, day.watch, study.simulate)
 _ANSWERS = (bounds.bounds, study.benchmark, answers.species, answers.kd)
-COMMANDS = (*_MOVIES, *_ANSWERS, results.export, results.view, results.app, setup.config)
+_RESULTS = (fit.figures, results.export, results.view, results.app)
+COMMANDS = (*_MOVIES, *_ANSWERS, *_RESULTS, setup.config)
 GROUPS = (
     ("calibrate", calibrate.SUMMARY, (calibrate.camera, calibrate.optics, calibrate.mass)),
     ("challenge", study.SUMMARY, (study.make, study.score)),

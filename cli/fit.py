@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from iscat_cli.console import Messages, listed, short, table
+from iscat_cli.console import Messages, listed, print_result, short, table
 from iscat_cli.options import (
     Count,
     ModeSetup,
@@ -78,9 +78,12 @@ class FitOutput(Output):
     -------
     --events N
         Print the first N events as well, or tracks; fits.csv and tracks.csv have all of them.
+    --figures
+        Draw figures for papers into the folder, PNG and SVG; `iscat figures` does so later.
     """
 
     events: Annotated[int, typer.Option(min=0)] = 0
+    figures: bool = False
 
 
 @command
@@ -96,9 +99,9 @@ def fit(
 ) -> None:
     """Fit the particles of a movie and set each spread beside its Cramér–Rao bounds.
 
-    Writes fits.csv, fits.parquet, summary.json, config.toml, report.html and figures to the
-    output folder; in mode track also tracks.csv and tracks.parquet: mass and diffusion
-    coefficient of every particle.
+    Writes fits.csv, fits.parquet, summary.json, config.toml and report.html to the output
+    folder; in mode track also tracks.csv and tracks.parquet: mass and diffusion coefficient of
+    every particle.
 
     Options
     -------
@@ -155,7 +158,7 @@ def fit(
         from iscat_analysis.pipeline import fit_stack
 
         how: Any = {"command": messages.command, "inject": inject or 0, "executor": executor}
-        how["overwrite"] = output.overwrite
+        how |= {"overwrite": output.overwrite, "figures": output.figures}
         analysis = fit_stack(stack, resolved, out=folder, **how, **told)
     rows = _show(messages, analysis, folder, output.events)
     if strict is not None and (
@@ -164,6 +167,48 @@ def fit(
         or codes & {finding.code for finding in analysis.findings}
     ):
         raise typer.Exit(3)  # something is flagged
+
+
+@command
+def figures(
+    messages: Messages,
+    result: Path,
+    *,
+    format_: Literal["pdf", "svg", "png"] = "pdf",
+    out: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Draw figures for papers of an analysis: masses, field, precision, tracks, single events.
+
+    Events are drawn where the movie is, at its old place or beside the result.
+
+    Options
+    -------
+    RESULT
+        Output folder of iscat fit.
+    --format pdf|svg|png
+        Kind of the files; PNG has 300 dots per inch.
+    --out DIR
+        Folder of the files; default the result's name with .figures.
+    --overwrite
+        Replace earlier figures.
+
+    Example: for a manuscript.
+
+        iscat figures movie.iscat --format pdf --out paper
+    """
+    from iscat_analysis.errors import DataError
+    from iscat_analysis.pipeline.stored import open_result
+
+    folder = result.with_suffix(".figures") if out is None else out
+    with open_result(result) as stored:
+        if folder.exists() and not overwrite:
+            raise DataError(f"{folder}: is there already; pass `overwrite` to replace its figures")
+        written = stored.write_figures(folder, formats=(format_,))
+    if not any(path.name.startswith("event_") for path in written) and len(stored):
+        messages.note(f"the movie of {result} was not found, so no single event is drawn")
+    for path in written:
+        print_result(str(path))
 
 
 def _show(

@@ -32,13 +32,15 @@ Whole jobs, from a movie to a report::
     setup = ia.configure("setup.toml", settings={"optics.na": 1.42})
     ia.instruments              # named set-ups to begin with: ia.configure(instrument="iscat")
     result = ia.fit_movie("movie.tif", config=setup, background=(0, 200))
-    result                      # summary and table; in a notebook, drawn as HTML
+    result                      # species, counts, errors; in a notebook, drawn as HTML
+    result.species              # pandas.DataFrame, one row per species; .events, .findings
     result.table                # pandas.DataFrame, one row per event
-    result.view(0)              # matplotlib Figure: data, model, residual
+    result.plot_masses()        # matplotlib Axes; also plot_field, plot_precision, plot_tracks
+    result.plot_event(0)        # data, model, residual
     result.posterior(0)         # arviz.InferenceData
     result.tracks               # of particles that move: mass, D, one row per track
     result.save("movie.iscat")  # report.html, fits.csv, fits.parquet, …
-    ia.open_result("movie.iscat").view(0)           # a folder that was written before
+    ia.open_result("movie.iscat").plot_event(0)     # a folder that was written before
     ia.Preview(ia.open_stack("movie.tif"), setup).look(200).found()  # what the search sees there
     ia.calibrate_optics("movie.tif", config=setup)  # focus, aberrations… from the movie itself
     ia.batch("samples.csv", out="day", config=setup)  # a day's movies: calibrations, one picture

@@ -7,73 +7,54 @@ configuration are given as a mapping.
 from __future__ import annotations
 
 import html
-import math
-import textwrap
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
 from iscat_analysis.answers.calibrations import optics_calibration
 from iscat_analysis.bounds import bounds_report, parse_scan, scan
 from iscat_analysis.bounds.shared import EVENTS, OpticsForecast
 from iscat_analysis.bounds.shared import forecast_optics as _forecast
 from iscat_analysis.config import LARGEST_NM, Config, Source, configure
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.executors import THREADS, open_executor
-from iscat_analysis.findings import Finding
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.inference.checks import number_in, path_in, truth_in
 from iscat_analysis.instrument.learning import calibrate_movie
 from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.pipeline import analyse
+from iscat_analysis.pipeline.stored import MovieResult
 from iscat_analysis.records import (
-    BUDGET_COLUMNS,
-    FREE_PARAMETERS,
     Analysis,
     EventView,
     FloatArray,
+    PosteriorResult,
     Progress,
+    Status,
     silent,
-    tally,
 )
-from iscat_analysis.report import answer, check_output, write_report
+from iscat_analysis.report import check_output, write_report
 from iscat_analysis.report.exchange import to_napari, to_trackpy
-from iscat_analysis.report.figures import draw, draw_corner, draw_view, posterior_of, view_of
-from iscat_analysis.report.numbers import UNITS, number
-from iscat_analysis.report.tables import event_table, posterior_groups
+from iscat_analysis.report.tables import posterior_groups
 from iscat_analysis.study.simulate import write_stack
 from iscat_analysis.text import in_page
-from iscat_analysis.units import count
 
 if TYPE_CHECKING:
     from arviz import InferenceData
+    from matplotlib.figure import Figure
 
 Settings = Mapping[str, Any] | Iterable[str]
 """Values of the configuration by key, or as ``"section.key = value"``."""
 
-ROWS_SHOWN = 20
-"""Events that a `Result` shows of itself in a notebook."""
-
-_COLUMNS = ("event", "frame", "x_px", "y_px", "z_nm", "mass_kda")
-_MEASURED = (
-    "mass_kda",
-    "sigma_mass_kda",
-    "crb_mass_kda",
-    "d_um2_s",
-    "sigma_d_um2_s",
-    "crb_d_um2_s",
-)
-_OF_TRACK = ("track", "first_frame", "last_frame", "n_frames")
-_TRACK_COLUMNS = (*_OF_TRACK, *_MEASURED, "diameter_nm", "sigma_diameter_nm")
-
 
 @dataclass(frozen=True, repr=False)
-class Result:
+class Result(MovieResult):
     """What a fit found; shows itself in a notebook.
 
     Attributes
@@ -84,61 +65,13 @@ class Result:
 
     analysis: Analysis
 
-    @property
-    def table(self) -> pd.DataFrame:
-        """One row per event, the columns of ``fits.csv``, which carry their units."""
-        return self.analysis.table
-
-    @property
-    def tracks(self) -> pd.DataFrame:
-        """Mode ``track``: one row per track, the columns of ``tracks.csv``; else empty."""
-        return answer.tracks_of(self.analysis)
-
-    @property
-    def summary(self) -> Mapping[str, Any]:
-        """Counts, medians, efficiency and provenance, as in ``summary.json``."""
-        return self.analysis.summary
-
-    @property
-    def budget(self) -> pd.DataFrame:
-        """What the error of a mass is made of, one row per source, as in ``summary.json``.
-
-        Columns `name`, `kind` (measured, learned or assumed), `common` (shared by all rows: these
-        add up to ``systematic_mass_kda``), `sigma_mass_kda` [kDa], `sigma_rel`, `dof`, `remedy`;
-        medians over the rows that are ok.  Empty where no masses are fitted.
-        """
-        return pd.DataFrame(self.summary.get("budget", ()), columns=list(BUDGET_COLUMNS))
-
-    @property
-    def mode(self) -> str:
-        """What was free: ``"mass"``, ``"localize"``, ``"joint"`` or ``"track"``."""
-        return self.analysis.mode
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What the user should know, each with a code, a severity, its values and a remedy."""
-        return self.analysis.findings
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Sentences of the findings that are more than a note."""
-        return self.analysis.warnings
-
-    @property
-    def config_toml(self) -> str:
-        """The resolved configuration, which reruns the job."""
-        return self.analysis.config_toml
-
-    def __len__(self) -> int:
-        return len(self.analysis.table)
-
-    def images(self, event: int) -> EventView:
+    def images(self, row: int) -> EventView:
         """Give the images of one event.
 
         Parameters
         ----------
-        event : int
-            Its number in the table.
+        row : int
+            The event's number in the table.
 
         Returns
         -------
@@ -151,58 +84,7 @@ class Result:
         DataError
             There is no such event.
         """
-        return view_of(self.analysis, event)
-
-    def view(self, event: int) -> Figure:
-        """Draw data, model and residual of one event; of landing movies its trace too.
-
-        Parameters
-        ----------
-        event : int
-            Its number in the table.
-
-        Returns
-        -------
-        matplotlib.figure.Figure
-            Three panels, and below them the contrast against frame where there is a trace.
-
-        Raises
-        ------
-        DataError
-            There is no such event.
-        """
-        view = view_of(self.analysis, event)
-        return draw_view(view, self.analysis.scheme, self.analysis.pixel_size_nm)
-
-    def overview(self) -> Figure:
-        """Draw the field of view, its events numbered.
-
-        Returns
-        -------
-        Figure
-            Image with a ring for each event.
-        """
-        return draw(self.analysis, "overview")
-
-    def histogram(self) -> Figure:
-        """Draw the histogram of the masses [kDa]; of the heights [nm] where the mass is fixed.
-
-        Returns
-        -------
-        Figure
-            Histogram of all events that are ok.
-        """
-        return draw(self.analysis, "histogram")
-
-    def precision(self) -> Figure:
-        """Draw each event's σ and QCRB against its CRB, for every free parameter.
-
-        Returns
-        -------
-        Figure
-            One panel for each free parameter.
-        """
-        return draw(self.analysis, "precision")
+        return _view_of(self.analysis, row)
 
     def corner(self, event: int) -> Figure:
         """Draw the posterior of one event.
@@ -222,7 +104,9 @@ class Result:
         DataError
             There is no such event, it was not sampled, or its chain did not converge.
         """
-        return draw_corner(self.analysis, event)
+        from iscat_analysis.report.plots import figure_of, plot_corner
+
+        return figure_of(plot_corner(_posterior_of(self.analysis, event), event))
 
     def posterior(self, event: int) -> InferenceData:
         """Give the posterior samples of one event.
@@ -243,12 +127,12 @@ class Result:
         DataError
             There is no such event, it was not sampled, or its chain did not converge.
         """
-        posterior_of(self.analysis, event)
+        _posterior_of(self.analysis, event)
         with warnings.catch_warnings():
             # ArviZ announces its next major version on import, once a day.
             warnings.simplefilter("ignore", FutureWarning)
             import arviz
-        groups = posterior_groups(self.analysis, [view_of(self.analysis, event)])
+        groups = posterior_groups(self.analysis, [_view_of(self.analysis, event)])
         return arviz.InferenceData(**{name: group.isel(event=0) for name, group in groups.items()})
 
     def trackpy(self) -> pd.DataFrame:
@@ -271,8 +155,8 @@ class Result:
         """
         return to_napari(self.table)
 
-    def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
-        """Write the report, the tables and the figures into a folder.
+    def save(self, folder: str | Path, *, overwrite: bool = False, figures: bool = False) -> Path:
+        """Write the report and the tables into a folder.
 
         Parameters
         ----------
@@ -280,6 +164,8 @@ class Result:
             Appears complete or not at all.
         overwrite : bool
             Replace an earlier result.
+        figures : bool
+            Draw the figures of `write_figures` into its folder ``figures`` as well.
 
         Returns
         -------
@@ -291,66 +177,41 @@ class Result:
         DataError
             The folder holds something already, or cannot be written.
         """
-        return write_report(self.analysis, Path(folder), overwrite=overwrite)
+        return write_report(self.analysis, Path(folder), overwrite=overwrite, figures=figures)
 
-    def _heading(self) -> str:
-        analysis = self.analysis
-        name = Path(analysis.provenance.input_path).name or "movie"
-        found = count(tally(analysis.table).number, "event")
-        if analysis.tracks is not None:
-            found = f"{count(len(self.tracks), 'track')} of {count(len(self), 'position')}"
-        return f"{found} in {name}, mode {analysis.mode}"
 
-    def _facts(self) -> list[tuple[str, str]]:
-        table, tracked = event_table(self.analysis), self.analysis.tracks is not None
-        facts = [("", text) for text in answer.headline(self.analysis, table)] if len(self) else []
-        rows = tally(self.tracks if tracked else table)
-        facts.append(("status", rows.text("track" if tracked else "event")))
-        for name in FREE_PARAMETERS[self.mode] if answer.caution(table) is None else ():
-            p = answer.precision_of(self.analysis, table, name)
-            if p.events:
-                text = f"σ {number(p.sigma)}{p.shared}, CRB {number(p.crb)}"
-                text += f", Holevo {number(p.holevo)}" if math.isfinite(p.holevo) else ""
-                text += f", QCRB {number(p.qcrb)}"
-                facts.append(
-                    (answer.label_of(self.analysis, name), f"{text} {UNITS[name]} (medians)")
-                )
-        return facts + [("warning", text) for text in self.warnings]
+def _view_of(analysis: Analysis, event: int) -> EventView:
+    """Find the images of one event."""
+    if isinstance(event, bool) or not isinstance(event, (int, np.integer)):
+        raise ConfigError(f"event = {event!r}: events have whole numbers, as in view(0)")
+    for view in analysis.views:
+        if view.event == event:
+            return view
+    known = [view.event for view in analysis.views]
+    numbered = f"it has events {min(known)} to {max(known)}" if known else "no event was found"
+    raise DataError(f"{_movie(analysis)}: there is no event {event}; {numbered}")
 
-    def __repr__(self) -> str:
-        wrap = textwrap.TextWrapper(78, initial_indent="  ", subsequent_indent="    ").wrap
-        facts = (wrap(f"{name} {text}".strip()) for name, text in self._facts())
-        lines = [line for fact in facts for line in fact]
-        looks = ".view(0), .histogram(), .posterior(0)"
-        if self.analysis.tracks is not None:
-            looks = ".tracks, .overview(), .view(0), .histogram()"
-        hint = f"  look at .table, {looks}; keep with .save(folder)"
-        return "\n".join([f"Result: {self._heading()}", *lines, hint])
 
-    def _repr_html_(self) -> str:
-        facts = "".join(
-            f"<tr><th style='text-align:left'>{html.escape(in_page(name))}</th>"
-            f"<td style='text-align:left'>{html.escape(in_page(text))}</td></tr>"
-            for name, text in self._facts()
+def _posterior_of(analysis: Analysis, event: int) -> PosteriorResult:
+    """Find the converged chain of one event."""
+    posterior = _view_of(analysis, event).posterior
+    if posterior is None:
+        status = analysis.table.loc[analysis.table["event"] == event, "status"].iloc[0]
+        why = "" if status == Status.OK else f" (its fit is {status})"
+        raise DataError(
+            f"{_movie(analysis)}: the posterior of event {event} was not sampled{why}; "
+            "fit again with posterior.enabled = true"
         )
-        names = [*_COLUMNS, *(f"sigma_{name}" for name in FREE_PARAMETERS[self.mode]), "status"]
-        listed = self.table
-        if self.analysis.tracks is not None:
-            names, listed = [*_TRACK_COLUMNS, "status"], self.tracks
-        shown = listed.head(ROWS_SHOWN)
-        if answer.main_quantity(self.analysis).column == "contrast":
-            new = {"mass_kda": "contrast", "sigma_mass_kda": "sigma_contrast"}
-            shown = answer.as_contrasts(shown)[names].rename(columns=new)
-        else:
-            shown = shown[names]
-        rest = len(listed) - len(shown)
-        where = ".table" if listed is self.table else ".tracks"
-        more = f"<p>… and {rest} more in <code>{where}</code></p>" if rest else ""
-        body = shown.to_html(index=False, float_format="{:.4g}".format, border=0, escape=True)
-        return (
-            f"<p><b>{html.escape(in_page(self._heading()))}</b></p><table>{facts}</table>"
-            f"{body if len(listed) else ''}{more}"
+    if not posterior.converged:
+        raise DataError(
+            f"{_movie(analysis)}: the chain of event {event} has not converged "
+            f"({posterior.message}), so it is not a posterior; raise posterior.steps"
         )
+    return posterior
+
+
+def _movie(analysis: Analysis) -> str:
+    return analysis.provenance.input_path or "the movie"
 
 
 @dataclass(frozen=True, repr=False)
@@ -437,6 +298,7 @@ def fit_movie(
     scheduler_file: str | Path | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
+    figures: bool = False,
     progress: Progress = silent,
 ) -> Result:
     """Fit the particles of a movie; in memory, unless `out` names a folder.
@@ -474,6 +336,8 @@ def fit_movie(
         Folder for the report and the tables; nothing is written without it.
     overwrite : bool
         Replace an earlier result in `out`.
+    figures : bool
+        Draw figures for papers into `out`, as `Result.save` does.
     progress : Progress
         Called with the stage and the steps done and in all.
 
@@ -514,7 +378,7 @@ def fit_movie(
         analysis = analyse(stack, resolved, run, command=command)
     result = Result(analysis)
     if folder is not None:
-        result.save(folder, overwrite=overwrite)
+        result.save(folder, overwrite=overwrite, figures=truth_in("`figures`", figures))
     return result
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import iscat_analysis as ia
 from iscat_analysis.pipeline.preview import film_limits
-from iscat_analysis.report.figures import SHOWN_FRAMES
+from iscat_analysis.pipeline.stored import SHOWN_FRAMES
 
 
 class LazyFrames:
@@ -103,7 +103,7 @@ def result_layers(result: ia.StoredResult) -> list[LayerData]:
     name = result.folder.name
     with contextlib.suppress(ia.DataError):  # the table is worth looking at without the movie
         layers.append(movie_layer(LazyMovie(ia.open_stack(result.movie_path))))
-    if result.tracks is not None:
+    if len(result.tracks):
         layers += _tracks_layer(result)
     table = result.table
     placed = table[table[["x_px", "y_px"]].notna().all(axis=1)]
@@ -112,7 +112,7 @@ def result_layers(result: ia.StoredResult) -> list[LayerData]:
     if "landing" in result.summary:  # a slice is one step of the data thick
         scale[0] = float(SHOWN_FRAMES)
         points[:, 0] /= SHOWN_FRAMES
-    elif result.tracks is None:  # they are there in all frames after the background
+    elif result.analysis.tracks is None:  # they are there in all frames after the background
         points, scale = points[:, 1:], scale[1:]
     colours = ["lime" if status == ia.Status.OK else "orange" for status in placed["status"]]
     options = {
@@ -132,7 +132,7 @@ def result_layers(result: ia.StoredResult) -> list[LayerData]:
 def _tracks_layer(result: ia.StoredResult) -> list[LayerData]:
     """Make the layer of tracks; the features of a place are its row, and its track's."""
     rows = ia.tracked_rows(result.table)
-    if not len(rows) or result.tracks is None:
+    if not len(rows):
         return []
     whole = result.tracks.set_index("track").add_prefix("track_")
     features = rows.drop(columns="track", errors="ignore").join(whole, on="particle")

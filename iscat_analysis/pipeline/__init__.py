@@ -60,6 +60,7 @@ def fit_stack(
     *,
     out: Path | None = None,
     overwrite: bool = False,
+    figures: bool = False,
     progress: Progress = silent,
     notify: Notify = notify_nobody,
     command: str = "",
@@ -78,6 +79,8 @@ def fit_stack(
         Output folder; default the movie's name with ``.iscat``.
     overwrite : bool
         Replace an earlier result.
+    figures : bool
+        Draw figures for papers into its folder ``figures``.
     progress : Progress
         Told how far each stage is.
     notify : callable
@@ -120,7 +123,7 @@ def fit_stack(
             run = Run(notify, progress, partial, executor or Executor(), inject)
             analysis = analyse(movie, config, run, command=command)
         with parts_kept(partial if kind.keeps_parts else None):
-            write_report(analysis, folder, overwrite=overwrite)
+            write_report(analysis, folder, overwrite=overwrite, figures=figures)
         if not analysis.summary["interrupted"]:
             remove_parts(partial)
     if analysis.summary["interrupted"]:

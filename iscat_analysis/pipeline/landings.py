@@ -418,6 +418,4 @@ def _step(neighbours: Neighbours, row: pd.Series[Any], corner: tuple[int, int]) 
     return neighbours.draw(-1 if mass < 0 else 1, at, start)
 
 
-LANDING = Kind(
-    "landing", find_landings, LandingSearch, StoredSteps, inject_and_recover,
-)  # fmt: skip
+LANDING = Kind("landing", find_landings, LandingSearch, StoredSteps, inject_and_recover)

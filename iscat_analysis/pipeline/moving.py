@@ -140,10 +140,8 @@ class StoredTracks:
         self._context = tracking_context(ready.config, ready.shape, frames, ready.lines)
         self._edges = [first + (last - first) * k // blocks for k in range(blocks + 1)]
         self._known = table["mass_kda"].notna() & table["track"].notna()
-        self._diffusion: dict[int, float] = {}
-        if tracks is not None:
-            found = np.nan_to_num(tracks["d_um2_s"].to_numpy(float))
-            self._diffusion = dict(zip(tracks["track"].astype(int), found.tolist(), strict=True))
+        found = np.nan_to_num(tracks["d_um2_s"].to_numpy(float))
+        self._diffusion = dict(zip(tracks["track"].astype(int), found.tolist(), strict=True))
         self._opened = lru_cache(1)(self._open)
 
     def _open(

@@ -1,25 +1,431 @@
-"""A stored result, and the images of its events, made again from the movie."""
+"""What a result offers, in memory or from its folder; and a folder whose movie is read again."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import html
+import math
+import textwrap
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.diagnosis import calibrated
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.findings import KINDS, Finding
 from iscat_analysis.inference.checks import path_in
 from iscat_analysis.movie import Stack, open_stack, split_address
 from iscat_analysis.pipeline.kinds import Redraw, kind_of
 from iscat_analysis.reading import read_json, read_parquet
-from iscat_analysis.records import EventView, tally
-from iscat_analysis.report.answer import answer_in
-from iscat_analysis.report.figures import draw_view, event_facts
+from iscat_analysis.records import (
+    BUDGET_COLUMNS,
+    FREE_PARAMETERS,
+    PARAMETERS,
+    Analysis,
+    EventView,
+    Provenance,
+    Status,
+    counted,
+    tally,
+)
+from iscat_analysis.report import answer
+from iscat_analysis.report.numbers import LABELS, UNITS, number
+from iscat_analysis.report.tables import event_table
+from iscat_analysis.text import in_page
+from iscat_analysis.units import count
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from iscat_analysis.report.plots import Panels
+
+SHOWN_FRAMES = 12
+"""Frames around its own in which an event of a landing movie is marked in a film."""
+
+
+class MovieResult:
+    """What was found in a movie: tables, the answer and figures, in memory or from a folder.
+
+    Attributes
+    ----------
+    analysis : Analysis
+        Everything, as the stages know it.
+    """
+
+    analysis: Analysis
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """One row per event, the columns of ``fits.csv``, which carry their units."""
+        return self.analysis.table
+
+    @property
+    def events(self) -> pd.DataFrame:
+        """The rows of `table` that are counted as events: no side lobes of others."""
+        return counted(self.table)
+
+    @property
+    def tracks(self) -> pd.DataFrame:
+        """Mode ``track``: one row per track, the columns of ``tracks.csv``; else empty."""
+        return answer.tracks_of(self.analysis)
+
+    @property
+    def species(self) -> pd.DataFrame:
+        """One row per species, the lightest first; empty where there are none.
+
+        Columns `mass_kda` (or `contrast`, without a scale of masses, or `diameter_nm` of spheres),
+        ``sigma_…`` and ``systematic_…`` of it, `count`, `share` with `share_low` and `share_high`
+        (95 %), `landing`, `leaving`.
+        """
+        return answer.species_of(self.analysis)
+
+    @property
+    def summary(self) -> Mapping[str, Any]:
+        """Counts, medians, efficiency and provenance, as in ``summary.json``."""
+        return self.analysis.summary
+
+    @property
+    def budget(self) -> pd.DataFrame:
+        """What the error of a mass is made of, one row per source, as in ``summary.json``.
+
+        Columns `name`, `kind` (measured, learned or assumed), `common` (shared by all rows: these
+        add up to ``systematic_mass_kda``), `sigma_mass_kda` [kDa], `sigma_rel`, `dof`, `remedy`;
+        medians over the rows that are ok.  Empty where no masses are fitted.
+        """
+        return pd.DataFrame(self.summary.get("budget", ()), columns=list(BUDGET_COLUMNS))
+
+    @property
+    def mode(self) -> str:
+        """What was free: ``"mass"``, ``"localize"``, ``"joint"`` or ``"track"``."""
+        return self.analysis.mode
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the user should know, each with a code, a severity, its values and a remedy."""
+        return self.analysis.findings
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences of the findings that are more than a note."""
+        return self.analysis.warnings
+
+    @property
+    def config_toml(self) -> str:
+        """The resolved configuration, which reruns the job."""
+        return self.analysis.config_toml
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def images(self, row: int) -> EventView:
+        """Give the images of an event."""
+        raise NotImplementedError
+
+    def facts(self, row: int) -> list[tuple[str, str]]:
+        """Say in words what was found of a row of the table.
+
+        Parameters
+        ----------
+        row : int
+            Position in the table.
+
+        Returns
+        -------
+        list of (str, str)
+            What is told, and its value with error, bound and unit.
+        """
+        return event_facts(self.table.iloc[row])
+
+    # ---- Figures -----------------------------------------------------------------------------
+
+    def plot_masses(self, *, ax: Axes | None = None, bins: int | ArrayLike | None = None) -> Axes:
+        """Draw the histogram of masses, landings and leavings by magnitude, and the species.
+
+        Without a scale of masses it is of contrasts, of spheres of diameters [nm], and of heights
+        [nm] where the mass is fixed.
+
+        Parameters
+        ----------
+        ax : matplotlib.axes.Axes, optional
+            Where to draw; default a figure that shows itself in a notebook.
+        bins : int or array_like, optional
+            Number of bins, or their edges; default two standard deviations wide.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+            What was drawn into.
+
+        Raises
+        ------
+        DataError
+            No event was found.
+        """
+        from iscat_analysis.report import plots
+
+        return plots.plot_masses(self.analysis, ax=ax, bins=bins)
+
+    def plot_precision(self, *, ax: Any = None) -> Panels:
+        """Draw each event's σ and QCRB against its CRB, for every free parameter.
+
+        Parameters
+        ----------
+        ax : Axes or sequence of Axes, optional
+            One axes for each free parameter, or one for the mass, or else the height.
+
+        Returns
+        -------
+        ndarray of matplotlib.axes.Axes
+            What was drawn into.
+
+        Raises
+        ------
+        DataError
+            No event was found.
+        ConfigError
+            The number of axes is another one.
+        """
+        from iscat_analysis.report import plots
+
+        return plots.plot_precision(self.analysis, ax=ax)
+
+    def plot_field(self, *, ax: Axes | None = None) -> Axes:
+        """Draw the field of view with its events numbered, or the paths of its tracks.
+
+        Parameters
+        ----------
+        ax : matplotlib.axes.Axes, optional
+            Where to draw; default a figure that shows itself in a notebook.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+            What was drawn into.
+        """
+        from iscat_analysis.report import plots
+
+        return plots.plot_field(self.analysis, ax=ax)
+
+    def plot_tracks(self, *, ax: Axes | None = None) -> Axes:
+        """Draw mass, or contrast, and diffusion coefficient of every track.
+
+        Parameters
+        ----------
+        ax : matplotlib.axes.Axes, optional
+            Where to draw; default a figure that shows itself in a notebook.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+            What was drawn into.
+
+        Raises
+        ------
+        DataError
+            There are no tracks with both.
+        """
+        from iscat_analysis.report import plots
+
+        return plots.plot_tracks(self.analysis, ax=ax)
+
+    def plot_event(self, row: int, *, ax: Any = None) -> Panels:
+        """Draw data, model and residual of an event; of landing movies its trace too.
+
+        Parameters
+        ----------
+        row : int
+            As for `images`.
+        ax : sequence of Axes, optional
+            Three, or four, of which the last takes the contrast against frame.
+
+        Returns
+        -------
+        ndarray of matplotlib.axes.Axes
+            What was drawn into.
+
+        Raises
+        ------
+        DataError, ConfigError
+            As for `images`; or the number of axes is another one.
+        """
+        from iscat_analysis.report import plots
+
+        analysis = self.analysis
+        return plots.plot_event(self.images(row), analysis.scheme, analysis.pixel_size_nm, ax=ax)
+
+    def view(self, row: int) -> Figure:
+        """Draw data, model and residual of an event; of landing movies its trace too.
+
+        Parameters
+        ----------
+        row : int
+            As for `images`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            Three panels, and below them the contrast against frame where there is a trace.
+
+        Raises
+        ------
+        DataError, ConfigError
+            As for `images`.
+        """
+        return _figure(self.plot_event(row))
+
+    def histogram(self, *, ax: Axes | None = None, bins: int | ArrayLike | None = None) -> Figure:
+        """Give the figure of `plot_masses`.
+
+        Parameters
+        ----------
+        ax, bins
+            As for `plot_masses`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            It shows itself in a notebook.
+        """
+        return _figure(self.plot_masses(ax=ax, bins=bins))
+
+    def overview(self) -> Figure:
+        """Give the figure of `plot_field`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            It shows itself in a notebook.
+        """
+        return _figure(self.plot_field())
+
+    def precision(self) -> Figure:
+        """Give the figure of `plot_precision`.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            It shows itself in a notebook.
+        """
+        return _figure(self.plot_precision())
+
+    def write_figures(
+        self, folder: str | Path, *, formats: tuple[str, ...] = ("png", "svg")
+    ) -> list[Path]:
+        """Write the figures of papers, with the images of the first events.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Made if it is not there.
+        formats : tuple of str
+            Some of ``png``, ``svg``, ``pdf``.
+
+        Returns
+        -------
+        list of Path
+            The files.
+        """
+        from iscat_analysis.report import plots
+
+        return plots.write_figures(self.analysis, path_in("`folder`", folder), formats)
+
+    # ---- What it shows of itself ---------------------------------------------------------------
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        known = [each for each in dir(type(self)) if not each.startswith("_")]
+        near = get_close_matches(name, known, 3, 0.5) or [n for n in known if name in n]
+        hint = f"; did you mean {' or '.join(near)}?" if near else ""
+        raise AttributeError(f"a {type(self).__name__} has no {name!r}{hint}")
+
+    def _heading(self) -> str:
+        analysis = self.analysis
+        name = Path(analysis.provenance.input_path).name or "movie"
+        found = count(tally(analysis.table).number, "event")
+        if analysis.tracks is not None:
+            found = f"{count(len(self.tracks), 'track')} of {count(len(self), 'position')}"
+        return f"{found} in {name}, mode {analysis.mode}"
+
+    def _precision(self) -> list[str]:
+        """Say how large the errors are, of each parameter that is free."""
+        table, lines = event_table(self.analysis), []
+        for name in FREE_PARAMETERS[self.mode] if answer.caution(table) is None else ():
+            p = answer.precision_of(self.analysis, table, name)
+            if p.events and not (name == "mass_kda" and answer.is_uncalibrated(self.analysis)):
+                text = f"σ {number(p.sigma)}{p.shared}, CRB {number(p.crb)}"
+                text += f", Holevo {number(p.holevo)}" if math.isfinite(p.holevo) else ""
+                text += f", QCRB {number(p.qcrb)} {UNITS[name]} (medians)"
+                lines.append(f"{answer.label_of(self.analysis, name)}: {text}")
+        return lines
+
+    def __repr__(self) -> str:
+        said, wrap = answer.spoken(self.analysis), textwrap.TextWrapper(78).wrap
+        wrap = textwrap.TextWrapper(78, initial_indent="  ", subsequent_indent="    ").wrap
+        rows = [[column.label for column in said.species.columns], *said.species.rows]
+        wide = [max(map(len, cells)) for cells in zip(*rows, strict=True)]
+        lines = [
+            "  " + "  ".join(cell.rjust(n) for cell, n in zip(row, wide, strict=True))
+            for row in rows
+            if row
+        ]
+        told = [*said.facts, said.totals, *said.cautions, *self._precision()]
+        more = [f"warning: {text}" for text in self.warnings]
+        hint = "look at .species, .table, .plot_masses(), .plot_field(), .plot_event(0)"
+        if self.analysis.tracks is not None:
+            hint = "look at .tracks, .plot_tracks(), .plot_masses(), .plot_field()"
+        lines += [line for text in told + more for line in wrap(text)]
+        lines = [f"{type(self).__name__}: {self._heading()}", *lines]
+        if len(lines) > ROWS_SHOWN - 2:
+            lines = [*lines[: ROWS_SHOWN - 2], "  … and more in .findings"]
+        return "\n".join([*lines, *wrap(hint)])
+
+    def _repr_html_(self) -> str:
+        said = answer.spoken(self.analysis)
+        species = pd.DataFrame(
+            said.species.rows, columns=[column.label for column in said.species.columns]
+        )
+        told = [*said.facts, said.totals, *said.cautions, *self._precision(), *self.warnings]
+        lines = "".join(f"<p>{html.escape(in_page(text))}</p>" for text in told)
+        body = species.to_html(index=False, border=0, escape=True) if len(species) else ""
+        return f"<p><b>{html.escape(in_page(self._heading()))}</b></p>{body}{lines}"
+
+
+ROWS_SHOWN = 20
+"""Lines that a result shows of itself."""
+
+
+def _figure(drawn: Axes | Panels) -> Figure:
+    from iscat_analysis.report.plots import figure_of
+
+    return figure_of(drawn)
+
+
+def event_facts(row: pd.Series[Any]) -> list[tuple[str, str]]:
+    """Say in words what was found of an event: its numbers, with errors and bounds."""
+    name, number = "event", row["event"]
+    if "track" in row and pd.notna(row["track"]):
+        name, number = "track", int(row["track"])
+    when = "leaves at frame" if row["mass_kda"] < 0 else "frame"
+    facts = [(name, f"{number}, {when} {row['frame']}")]
+    for key in (PARAMETERS[-1], *PARAMETERS[:-1]):
+        if not np.isfinite(row[key]):
+            continue
+        sigma, bound = row[f"sigma_{key}"], row[f"crb_{key}"]
+        error = f" ± {sigma:.1f}" if np.isfinite(sigma) else ""
+        beside = f" (CRB {bound:.1f})" if np.isfinite(bound) else ""
+        facts.append((LABELS[key], f"{row[key]:.1f}{error} {UNITS[key]}{beside}"))
+    status = Status(row["status"])
+    facts.append(("contrast", f"{100 * row['contrast']:.3f} %, SNR {row['snr']:.1f}"))
+    return [*facts, ("status", f"{status.value}: {status.advice}")]
 
 
 def open_result(folder: str | Path, *, movie: str | Path | None = None) -> StoredResult:
@@ -56,7 +462,7 @@ def open_result(folder: str | Path, *, movie: str | Path | None = None) -> Store
     )
 
 
-class StoredResult:
+class StoredResult(MovieResult):
     """A result that was written before; `open_result` makes it.
 
     Parameters
@@ -70,12 +476,8 @@ class StoredResult:
     ----------
     folder : Path
         The output folder.
-    table : pandas.DataFrame
-        ``fits.csv``.
-    tracks : pandas.DataFrame or None
-        ``tracks.csv``, in mode ``track``.
-    summary : mapping
-        ``summary.json``.
+    analysis : Analysis
+        What the folder says, without images.
     config : Config
         ``config.toml``, the resolved configuration.
 
@@ -89,10 +491,10 @@ class StoredResult:
         self.folder = folder
         self._movie = movie
         try:
-            self.table: pd.DataFrame = read_parquet(folder / "fits.parquet")
-            self.summary: Mapping[str, Any] = read_json(folder / "summary.json")
-            tracks = folder / "tracks.parquet"
-            self.tracks: pd.DataFrame | None = read_parquet(tracks) if tracks.is_file() else None
+            table: pd.DataFrame = read_parquet(folder / "fits.parquet")
+            summary: Mapping[str, Any] = read_json(folder / "summary.json")
+            tracked = folder / "tracks.parquet"
+            tracks = read_parquet(tracked) if tracked.is_file() else None
         except FileNotFoundError as error:
             missing = Path(error.filename).name if error.filename else "such file"
             raise DataError(
@@ -101,27 +503,29 @@ class StoredResult:
         except (OSError, ValueError) as error:
             raise DataError(f"{folder}: cannot be read as a result ({error})") from None
         self.config: Config = load_config(folder / "config.toml")
-
-    def __repr__(self) -> str:
-        said = [tally(self.table).text(), answer_in(self.folder)]
-        if self.tracks is not None:
-            said[0] = tally(self.tracks).text("track")
-        text = "; ".join(filter(None, said))
-        return f"<StoredResult {self.folder.name}, mode {self.mode}: {text}>"
+        about = summary["input"], summary["versions"], summary["seed"]
+        nothing = np.zeros(0)
+        self.analysis = Analysis(
+            config_toml=(folder / "config.toml").read_text(encoding="utf-8"),
+            mode=str(summary["mode"]),
+            scheme=self.config.optics.scheme,
+            pixel_size_nm=float(self.config.camera.pixel_size_nm or 0.0),
+            table=table,
+            views=(),
+            ratio_image=nothing,
+            power=nothing,
+            power_frames=nothing.astype(np.int64),
+            summary=summary,
+            provenance=Provenance("", about[0]["path"], about[0]["sha256"], *about[1:], ""),
+            findings=tuple(_findings(summary)),
+            tracks=tracks,
+        )
 
     def __enter__(self) -> StoredResult:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def __len__(self) -> int:
-        return len(self.table)
-
-    @property
-    def mode(self) -> str:
-        """What was free: ``"mass"``, ``"localize"``, ``"joint"`` or ``"track"``."""
-        return str(self.summary["mode"])
 
     @property
     def movie_path(self) -> Path:
@@ -185,44 +589,45 @@ class StoredResult:
             raise DataError(f"{self.folder.name}: row {row} has no place, so there is no image")
         return self._opened[1](row)
 
-    def view(self, row: int) -> Figure:
-        """Draw data, model and residual of a row of the table.
+    def write_figures(
+        self, folder: str | Path, *, formats: tuple[str, ...] = ("png", "svg")
+    ) -> list[Path]:
+        """Write the figures of papers; images of the first events only where the movie is there.
 
         Parameters
         ----------
-        row : int
-            As for `images`.
+        folder : str or Path
+            Made if it is not there.
+        formats : tuple of str
+            Some of ``png``, ``svg``, ``pdf``.
 
         Returns
         -------
-        matplotlib.figure.Figure
-            Three panels, and of a landing movie the contrast against frame below.
-
-        Raises
-        ------
-        DataError, ConfigError
-            As for `images`.
+        list of Path
+            The files.
         """
-        pixel_nm = float(self.config.camera.pixel_size_nm or 0.0)
-        return draw_view(self.images(row), self.config.optics.scheme, pixel_nm)
+        from iscat_analysis.report import plots
 
-    def facts(self, row: int) -> list[tuple[str, str]]:
-        """Say in words what was found of a row of the table.
-
-        Parameters
-        ----------
-        row : int
-            As for `images`.
-
-        Returns
-        -------
-        list of (str, str)
-            What is told, and its value with error, bound and unit.
-        """
-        return event_facts(self.table.iloc[row])
+        views = []
+        with suppress(DataError):  # without the movie
+            first = ~self.table["event"].duplicated() & self.table["x_px"].notna()
+            rows = np.flatnonzero(first)[: plots.EVENT_FIGURES].tolist()
+            views = [self.images(row) for row in rows]
+        target = path_in("`folder`", folder)
+        return plots.write_figures(self.analysis, target, formats, views=views)
 
     def close(self) -> None:
         """Release the movie, where it was opened; it is opened again when it is needed."""
         opened = self.__dict__.pop("_opened", None)
         if opened is not None:
             opened[0].close()
+
+
+def _findings(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    """Make the findings of a summary again, as far as this version knows their codes."""
+    for found in summary["findings"]:
+        kind, values = KINDS.get(found["code"]), found["values"]
+        if kind is not None and kind.names <= values.keys():
+            frames = found["frames"] and (int(found["frames"][0]), int(found["frames"][1]))
+            where, _, said = found["text"].rpartition(kind(values).text)
+            yield kind(values, where="" if said else where.removesuffix(": "), frames=frames)

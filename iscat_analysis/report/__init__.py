@@ -50,23 +50,30 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-def write_report(analysis: Analysis, folder: Path, *, overwrite: bool = False) -> Path:
+def write_report(
+    analysis: Analysis, folder: Path, *, overwrite: bool = False, figures: bool = False
+) -> Path:
     """Write everything one analysis found into a folder.
 
     ``fits.csv``, ``fits.parquet``, in mode ``track`` ``tracks.csv`` and ``tracks.parquet``,
     ``summary.json``, ``config.toml``, ``posterior.nc`` (where a posterior converged),
-    ``response.csv`` (where the camera is not linear) and ``report.html``.  The folder appears
-    complete or not at all; an earlier result is replaced only once the new one is complete.
+    ``response.csv`` (where the camera is not linear), ``report.html``, and ``figures/`` if they are
+    wanted.  The folder appears complete or not at all; an earlier result is replaced only once the
+    new one is complete.
     """
     with atomic_folder(folder, overwrite) as building:
-        fill_report(analysis, building)
+        fill_report(analysis, building, figures=figures)
     return folder
 
 
-def fill_report(analysis: Analysis, folder: Path) -> None:
+def fill_report(analysis: Analysis, folder: Path, *, figures: bool = False) -> None:
     """Write a report into a folder of its own."""
-    from iscat_analysis.report.movie_page import render_report
+    from iscat_analysis.report.movie_page import render_report  # its templates take long to load
 
     write_tables(analysis, folder)
     write_posterior(analysis, folder / "posterior.nc")
+    if figures:
+        from iscat_analysis.report.plots import write_figures
+
+        write_figures(analysis, folder / "figures")
     (folder / "report.html").write_text(render_report(analysis), encoding="utf-8")

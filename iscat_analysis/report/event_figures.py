@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import math
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,8 +14,6 @@ import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from markupsafe import Markup
-from matplotlib.axes import Axes
-from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
@@ -25,18 +21,20 @@ from PIL import Image, WebPImagePlugin
 
 from iscat_analysis.config import SCHEMES
 from iscat_analysis.records import Analysis, Clip, EventView, FloatArray, PosteriorResult, Trace
-from iscat_analysis.report.numbers import number, parameter
-from iscat_analysis.report.style import (
-    BLUE,
-    GREY,
-    INK,
-    VERMILLION,
-    Sketch,
-    Style,
-    display_range,
-    new_figure,
-    scale_bar,
+from iscat_analysis.report.numbers import number
+from iscat_analysis.report.plots import CREDIBLE_LEVELS as CREDIBLE_LEVELS
+from iscat_analysis.report.plots import (
+    DIVERGING,
+    figure_of,
+    plot_corner,
+    plot_event,
+    residual_limit,
+    trace_length,
+    trace_means,
+    trace_range,
 )
+from iscat_analysis.report.plots import credible_shades as credible_shades
+from iscat_analysis.report.style import Sketch, Style, display_range
 from iscat_analysis.units import count
 
 CORNER_FIGURES = 20
@@ -46,14 +44,8 @@ DETAIL_BYTES, FILM_BYTES = 2_000_000, 3_000_000
 """Images, traces and clips of events inside the page, at most, and films; what comes after that is
 left out."""
 
-CREDIBLE_LEVELS = (0.95, 0.75, 0.5, 0.25)
-"""Shades of a posterior's joint densities: the share of the probability inside each."""
-
 CLIP_MS = 180
 """Time for which a frame of a clip is shown."""
-
-DIVERGING = LinearSegmentedColormap.from_list("residual", ["#00528C", "#FAFAF8", "#BE4600"])
-"""Colours of residuals."""
 
 _GREYS = mpl.colormaps["gray"]
 _NOTHING = 255  # of a palette: transparent
@@ -144,15 +136,6 @@ class _Scale:
         return np.concatenate([data, gap, model, gap, residual], axis=-1)
 
 
-def residual_limit(residual: NDArray[np.float64]) -> float:
-    """Choose the range of a residual image: four standard deviations, more where it needs more.
-
-    Shapes: `residual` (y, x).
-    """
-    values = np.abs(residual[np.isfinite(residual)])
-    return max(4.0, math.ceil(np.quantile(values, 0.995))) if values.size else 4.0
-
-
 def shaded(values: NDArray[np.floating[Any]], shades: int, first: int = 0) -> NDArray[np.uint8]:
     """Give every pixel of an image the number of its shade, for `png_of`."""
     inside = np.rint(np.clip(np.nan_to_num(values), 0, 1) * (shades - 1)) + first
@@ -223,17 +206,18 @@ def views_of_rows(table: pd.DataFrame, views: Sequence[EventView]) -> list[tuple
     return [(first[view.event], view) for view in views if view.event in first]
 
 
-# ---- Figures -------------------------------------------------------------------------------------
+# ---- Figures of the page ------------------------------------------------------------------------
 
 
 def event_figures(analysis: Analysis, most: int) -> Iterator[Sketch]:
     """Name the images of the first events, and what draws them."""
-    times: Counter[int] = Counter()
     for view in analysis.views[:most]:
-        times[view.event] += 1
-        nth = times[view.event]
-        name = f"event_{view.event:04d}" + (f"_{nth}" if nth > 1 else "")
-        yield name, partial(triptych, view, analysis.scheme, analysis.pixel_size_nm)
+        yield f"event_{view.event:04d}", partial(_event, view, analysis)
+
+
+def _event(view: EventView, analysis: Analysis) -> Figure:
+    """Draw an event."""
+    return figure_of(plot_event(view, analysis.scheme, analysis.pixel_size_nm))
 
 
 def corner_figures(analysis: Analysis) -> Iterator[Sketch]:
@@ -244,89 +228,12 @@ def corner_figures(analysis: Analysis) -> Iterator[Sketch]:
         if view.posterior is not None and view.posterior.converged
     ]
     for event, posterior in sampled[:CORNER_FIGURES]:
-        yield f"corner_{event:04d}", partial(corner, posterior, event)
+        yield f"corner_{event:04d}", partial(_corner, posterior, event)
 
 
-def triptych(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:
-    """Draw data, model and residual of one event, and its contrast against frame."""
-    rows, columns = view.contrast.shape
-    tall = 2.55 * float(np.clip(rows / columns, 0.3, 3.0))
-    below = 0.0 if view.trace is None else 2.1  # inches
-    height = tall + 1.0 + below
-    figure = new_figure(8.4, height, constrained=False)
-    if view.trace is not None:
-        box = (0.075, 0.5 / height, 0.875, (below - 0.6) / height)
-        draw_trace(figure.add_axes(box), view.trace)
-    scale = _Scale.of(view, scheme)
-    panels = (
-        (f"event {view.event}, data", view.contrast, _GREYS, (scale.low, scale.high), scale.unit),
-        ("model", view.model, _GREYS, (scale.low, scale.high), scale.unit),
-        ("residual", view.residual, DIVERGING, (-scale.limit, scale.limit), "σ"),
-    )
-    for place, (title, image, colours, (low, high), label) in enumerate(panels):
-        x = 0.02 + place * 0.33
-        axes = figure.add_axes((x, (below + 0.62) / height, 0.3, tall / height))
-        shown = axes.imshow(image, colours, vmin=low, vmax=high, interpolation="nearest")
-        axes.set(xticks=[], yticks=[], title=title)
-        axes.spines[:].set_visible(False)
-        bar = figure.add_axes((x, (below + 0.48) / height, 0.3, 0.062 / height))
-        figure.colorbar(shown, cax=bar, orientation="horizontal", label=label)
-        bar.locator_params(nbins=4)
-        if not place:
-            scale_bar(axes, columns, rows, pixel_size_nm)
-    return figure
-
-
-def corner(posterior: PosteriorResult, event: int) -> Figure:
-    """Draw a posterior: each parameter, and each pair."""
-    n, bins = len(posterior.names), 24
-    flat = posterior.samples.reshape(-1, n)
-    figure = new_figure(1.9 * n + 0.6, 1.9 * n + 0.6, constrained=False)
-    grid = figure.subplots(n, n, squeeze=False, gridspec_kw={"wspace": 0.08, "hspace": 0.08})
-    figure.subplots_adjust(left=0.14, right=0.98, bottom=0.12, top=0.93)
-    ends = np.quantile(flat, [0.001, 0.999], axis=0).T
-    pads = 0.05 * np.ptp(ends, axis=1)
-    ends += np.outer(np.where(pads > 0, pads, 0.5), [-1, 1])
-    quantiles = np.quantile(flat, [0.15865, 0.5, 0.84135], axis=0)
-    shades = LinearSegmentedColormap.from_list("shades", ["white", BLUE])
-    for i, j in np.ndindex(n, n):
-        axes: Any = grid[i, j]
-        if j > i:
-            axes.set_axis_off()
-            continue
-        if i == j:
-            axes.hist(flat[:, i], bins=bins, range=ends[i], color=BLUE, alpha=0.35)
-            for value in quantiles[:, i]:
-                axes.axvline(value, color=INK, lw=0.8, ls="--")
-            axes.set_yticks([])
-        else:
-            span = [ends[j], ends[i]]
-            counts, ex, ey = np.histogram2d(flat[:, j], flat[:, i], bins=bins, range=span)
-            inside: Style = {"vmin": 0, "vmax": len(CREDIBLE_LEVELS), "rasterized": True}
-            axes.pcolormesh(ex, ey, credible_shades(counts).T, cmap=shades, **inside)
-            axes.set_ylim(*ends[i])
-            axes.locator_params(axis="y", nbins=4)
-        axes.set_xlim(*ends[j])
-        axes.locator_params(axis="x", nbins=3)
-        axes.tick_params(labelbottom=i == n - 1, labelleft=not j and i > 0)
-        if i == n - 1:
-            axes.set_xlabel(parameter(posterior.names[j]))
-        if i and not j:
-            axes.set_ylabel(parameter(posterior.names[i]))
-        axes.ticklabel_format(useOffset=False)
-    figure.suptitle(f"Posterior of event {event}", x=0.14, ha="left", fontsize=10)
-    return figure
-
-
-def credible_shades(counts: FloatArray) -> NDArray[np.int64]:
-    """Tell for each cell of a histogram which of the `CREDIBLE_LEVELS` contain it."""
-    flat = counts.ravel()
-    order = np.argsort(-flat, kind="stable")
-    ranked = flat[order]
-    shares = (np.cumsum(ranked) - ranked) / max(float(flat.sum()), 1.0)
-    shades = np.zeros(flat.size, dtype=np.int64)
-    shades[order] = np.less.outer(shares, CREDIBLE_LEVELS).sum(axis=1) * (ranked > 0)
-    return shades.reshape(counts.shape)
+def _corner(posterior: PosteriorResult, event: int) -> Figure:
+    """Draw a posterior."""
+    return figure_of(plot_corner(posterior, event))
 
 
 # ---- Traces --------------------------------------------------------------------------------------
@@ -334,7 +241,7 @@ def credible_shades(counts: FloatArray) -> NDArray[np.int64]:
 
 def trace_svg(trace: Trace) -> Markup:
     """Draw a trace for the page; its colours follow the theme."""
-    low, high = _range(trace)
+    low, high = trace_range(trace)
     frames, fine = len(trace.contrast), 1000  # steps of the curve's scale
     margin, upper, edge = 46, 24, 474  # left and above of the curve, and where it ends
     across, down, bottom = edge - margin, 128, 169
@@ -365,7 +272,7 @@ def trace_svg(trace: Trace) -> Markup:
     )
     scale = f"matrix({across / frames:.5g} 0 0 {down / fine:.5g} {margin} {upper})"
     levels = np.rint(np.clip((high - trace.contrast) / (high - low), 0, 1) * fine)
-    centres, means = _means(trace)
+    centres, means = trace_means(trace)
     shown = np.rint((high - means) / (high - low) * fine)
     dots = "".join(f"M{x:g} {y:.0f}h0" for x, y in zip(centres - trace.first, shown, strict=True))
     parts.append(
@@ -387,55 +294,15 @@ def trace_words(trace: Trace) -> str:
     when = f"frame {trace.frame}" + (f" ± {trace.half_width}" if trace.half_width else "")
     return (
         f"Contrast of each frame by the matched filter; dots: means of "
-        f"{count(_length(trace), 'frame')}. Line: the fitted step, at {when}, over the frames that "
-        f"were used. Noise expected of a frame: {number(1e3 * trace.sigma, 2)}×10⁻³."
+        f"{count(trace_length(trace), 'frame')}. Line: the fitted step, at {when}, over the frames "
+        f"that were used. Noise expected of a frame: {number(1e3 * trace.sigma, 2)}×10⁻³."
     )
-
-
-def draw_trace(axes: Axes, trace: Trace) -> None:
-    """Draw a trace."""
-    low, high = _range(trace)
-    frames = trace.first + np.arange(len(trace.contrast))
-    centres, means = _means(trace)
-    half, (begin, end) = max(trace.half_width, 0.5), trace.used
-    axes.axvspan(trace.frame - half, trace.frame + half, color=BLUE, alpha=0.18, lw=0)
-    axes.plot(frames + 0.5, 1e3 * trace.contrast, color=GREY, lw=0.6, alpha=0.6)
-    axes.plot(centres, 1e3 * means, ".", color=INK, ms=3.5)
-    levels = 1e3 * np.array([trace.before, trace.before, trace.after, trace.after])
-    axes.plot([begin, trace.frame, trace.frame, end], levels, color=VERMILLION, lw=1.6)
-    axes.set(xlim=(frames[0], frames[-1] + 1), ylim=(1e3 * low, 1e3 * high))
-    axes.set(xlabel="frame", ylabel="contrast [10⁻³]")
-
-
-def _range(trace: Trace) -> tuple[float, float]:
-    """Give the scale: both levels and nearly all frames, and always a proper interval."""
-    known = trace.contrast[np.isfinite(trace.contrast)]
-    ends = np.quantile(known, [0.005, 0.995]).tolist() if known.size else [0.0]
-    low, high = (pick(*ends, trace.before, trace.after) for pick in (min, max))
-    margin = 0.04 * (high - low) or 1e-6
-    return low - margin, high + margin
 
 
 def _ticks(low: float, high: float, most: int) -> list[float]:
     """Give round values within a range."""
     values = MaxNLocator(most, steps=[1, 2, 5, 10]).tick_values(low, high)
     return [float(value) for value in values if low <= value <= high]
-
-
-def _length(trace: Trace) -> int:
-    """Frames of a mean, of which there are about 40."""
-    return max(1, round(len(trace.contrast) / 40))
-
-
-def _means(trace: Trace) -> tuple[FloatArray, FloatArray]:
-    """Average frames, none across the step; where they lie [frames], and their means."""
-    length = _length(trace)
-    start = (trace.frame - trace.first) % length
-    number = (len(trace.contrast) - start) // length
-    parts = trace.contrast[start : start + number * length].reshape(number, length)
-    some = np.flatnonzero(np.isfinite(parts).any(axis=1))
-    centres = trace.first + start + (some + 0.5) * length
-    return np.asarray(centres), np.asarray(np.nanmean(parts[some], axis=1))
 
 
 def _curve(levels: FloatArray) -> str:

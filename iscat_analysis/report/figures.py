@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from textwrap import fill
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -16,28 +14,17 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import ScaledTranslation
 
-from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.records import (
-    PARAMETERS,
-    Analysis,
-    BoolArray,
-    EventView,
-    FloatArray,
-    PosteriorResult,
-    Status,
-    counted,
-    free_parameters,
-)
-from iscat_analysis.report import event_figures, track_figures
+from iscat_analysis.records import Analysis, BoolArray, FloatArray, Status, counted, free_parameters
+from iscat_analysis.report import track_figures
 from iscat_analysis.report.answer import label_of, main_quantity
-from iscat_analysis.report.numbers import LABELS, UNITS
+from iscat_analysis.report.numbers import UNITS
+from iscat_analysis.report.plots import histogram_bins
 from iscat_analysis.report.style import (
     BLUE,
     GREY,
     HALO,
     INK,
     PURPLE,
-    STYLE,
     VERMILLION,
     Sketch,
     Style,
@@ -54,10 +41,6 @@ from iscat_analysis.report.style import (
     whiskers,
     whole_numbers,
 )
-from iscat_analysis.report.tables import event_table
-
-SHOWN_FRAMES = 12
-"""Frames around its own in which an event of a landing movie is marked in a film."""
 
 _NAMES = {"mass_kda": "mass", "z_nm": "height", "n_scattered": "photon"}
 
@@ -130,12 +113,6 @@ def _stacked(axes: Axes, edges: Any, ok: FloatArray, flagged: FloatArray, color:
     if flagged.any():
         style: Style = {"fill": True, "color": color, "label": "flagged"}
         axes.stairs(ok + flagged, edges, baseline=ok, **style)
-
-
-def histogram_bins(extent: float, spread: FloatArray) -> int:
-    """Count bins of two standard deviations, which do not blur neighbouring species."""
-    width = 2 * float(np.median(spread)) if spread.size else 0.0
-    return int(np.clip(extent / width, 10, 90)) if width > 0 else 10
 
 
 def timeline(analysis: Analysis, table: pd.DataFrame) -> Figure:
@@ -357,96 +334,3 @@ def _name_row(axes: Axes, label: str) -> None:
     beside = ScaledTranslation(-0.7, 0, figure.dpi_scale_trans) if figure else axes.transAxes
     axes.yaxis.set_label_coords(0, 0.5, transform=axes.transAxes + beside)
     axes.yaxis.set_major_locator(MaxNLocator(3, integer=label == "events"))
-
-
-# ---- One at a time, for a notebook ---------------------------------------------------------------
-
-
-def draw(analysis: Analysis, kind: str) -> Figure:
-    """Draw one figure of the whole analysis: overview, histogram or precision."""
-    table = event_table(analysis)
-    main = table[main_quantity(analysis).column].to_numpy(float)
-    if kind != "overview" and not np.isfinite(main).any():
-        raise DataError(f"{_movie(analysis)}: no event was found, so there is no {kind} to draw")
-    if analysis.tracks is not None and kind == "histogram":
-        return _shown(partial(track_figures.distributions, analysis))
-    field = overview if analysis.tracks is None else track_figures.trajectories
-    makers = {"overview": field, "histogram": histogram, "precision": precision}
-    return _shown(partial(makers[kind], analysis, table))
-
-
-def draw_view(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:
-    """Draw data, model and residual of one event."""
-    return _shown(partial(event_figures.triptych, view, scheme, pixel_size_nm))
-
-
-def draw_corner(analysis: Analysis, event: int) -> Figure:
-    """Draw the posterior of one event: each parameter, and each pair."""
-    return _shown(partial(event_figures.corner, posterior_of(analysis, event), event))
-
-
-def view_of(analysis: Analysis, event: int) -> EventView:
-    """Find the images of one event."""
-    if isinstance(event, bool) or not isinstance(event, (int, np.integer)):
-        raise ConfigError(f"event = {event!r}: events have whole numbers, as in view(0)")
-    for view in analysis.views:
-        if view.event == event:
-            return view
-    known = [view.event for view in analysis.views]
-    numbered = f"it has events {min(known)} to {max(known)}" if known else "no event was found"
-    raise DataError(f"{_movie(analysis)}: there is no event {event}; {numbered}")
-
-
-def posterior_of(analysis: Analysis, event: int) -> PosteriorResult:
-    """Find the converged chain of one event."""
-    posterior = view_of(analysis, event).posterior
-    if posterior is None:
-        status = analysis.table.loc[analysis.table["event"] == event, "status"].iloc[0]
-        why = "" if status == Status.OK else f" (its fit is {status})"
-        raise DataError(
-            f"{_movie(analysis)}: the posterior of event {event} was not sampled{why}; "
-            "fit again with posterior.enabled = true"
-        )
-    if not posterior.converged:
-        raise DataError(
-            f"{_movie(analysis)}: the chain of event {event} has not converged "
-            f"({posterior.message}), so it is not a posterior; raise posterior.steps"
-        )
-    return posterior
-
-
-def event_facts(row: pd.Series[Any]) -> list[tuple[str, str]]:
-    """Say in words what was found of an event: its numbers, with errors and bounds."""
-    name, number = "event", row["event"]
-    if "track" in row and pd.notna(row["track"]):
-        name, number = "track", int(row["track"])
-    when = "leaves at frame" if row["mass_kda"] < 0 else "frame"
-    facts = [(name, f"{number}, {when} {row['frame']}")]
-    for key in (PARAMETERS[-1], *PARAMETERS[:-1]):
-        if not np.isfinite(row[key]):
-            continue
-        sigma, bound = row[f"sigma_{key}"], row[f"crb_{key}"]
-        error = f" ± {sigma:.1f}" if np.isfinite(sigma) else ""
-        beside = f" (CRB {bound:.1f})" if np.isfinite(bound) else ""
-        facts.append((LABELS[key], f"{row[key]:.1f}{error} {UNITS[key]}{beside}"))
-    status = Status(row["status"])
-    facts.append(("contrast", f"{100 * row['contrast']:.3f} %, SNR {row['snr']:.1f}"))
-    return [*facts, ("status", f"{status.value}: {status.advice}")]
-
-
-def _movie(analysis: Analysis) -> str:
-    return analysis.provenance.input_path or "the movie"
-
-
-def _shown(make: Callable[[], Figure]) -> Figure:
-    """Draw a figure that a notebook can ask for its picture, without pyplot and its state."""
-    with mpl.rc_context(STYLE):
-        figure = make()
-    setattr(figure, "_repr_png_", partial(_png, figure))  # noqa: B010
-    return figure
-
-
-def _png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=100)
-    return buffer.getvalue()

@@ -6,7 +6,6 @@ computed here.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import PurePath
 from typing import Any, Literal
@@ -28,6 +27,7 @@ from iscat_analysis.report.numbers import (
     tabulate,
 )
 from iscat_analysis.report.page import Chart, Section
+from iscat_analysis.report.plots import contents, figure_of, plot_kd
 from iscat_analysis.report.style import (
     BLUE,
     GREY,
@@ -255,47 +255,7 @@ def _short(source: str) -> str:
 
 def binding_figure(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     """Draw fractions of complexes with their intervals, the equilibrium and the profile."""
-    figure = new_figure(9.6, 3.6)
-    left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
-    dimer = found["model"] == "dimer"
-    rows, names = found["samples"], ("complexes", "complexes_low", "complexes_high", "predicted")
-    at = floats(row["concentration_nm"] if dimer else row["a_nm"] + row["b_nm"] for row in rows)
-    share, low, high, predicted = (floats(row.get(name) for row in rows) for name in names)
-    side = np.ones(at.size)
-    for value in np.unique(at):  # replicates beside each other
-        same = np.flatnonzero(at == value)
-        side[same] = 1 + 0.06 * (np.arange(same.size) - (same.size - 1) / 2)
-    whiskers(left, at * side, share, (low, high), style={"color": BLUE, "label": "tables, 95 %"})
-    line: Style = {"color": VERMILLION, "label": "equilibrium"}
-    if dimer:
-        left.plot(found["curve"]["concentration_nm"], found["curve"]["complexes"], **line)
-    else:
-        left.plot(at * side, predicted, "_", ms=12, mew=1.6, **line)
-    both, complexes = ("monomers", "dimers") if dimer else ("A and B", "AB")
-    left.set(xscale="log", ylim=(0, 1))
-    left.set(xlabel=f"{both} in all [nM]", ylabel=f"{complexes} among the particles")
-    left.legend(loc="upper left")
-    _draw_profile(right, found)
-    yield "kd", figure
-
-
-def _draw_profile(axes: Axes, found: Mapping[str, Any]) -> None:
-    """Draw twice the log-likelihood lost against K_D, and the limit of a 95 % interval."""
-    limit, best = 3.84, found["kd_nm"]
-    at, deviance = floats(found["profile"]["ln_kd_nm"]), floats(found["profile"]["deviance"])
-    if at.size > 1:
-        root = np.sign(at - np.log(best)) * np.sqrt(deviance)
-        fine = np.linspace(at[0], at[-1], 100)
-        axes.plot(np.exp(fine), np.interp(fine, at, root) ** 2, color=INK)
-    axes.plot(np.exp(at), deviance, "o", ms=3.5, color=INK)
-    axes.axhline(limit, color=GREY, lw=0.8, ls="--")
-    axes.axvline(best, color=VERMILLION, lw=1)
-    axes.set(xlabel="$K_D$ [nM]", ylabel="2 (largest log-likelihood − profile)")
-    axes.set(ylim=(0, 2.2 * limit), title=f"$K_D$ = {number(best)} nM")
-    low, high = found["kd_low"], found["kd_high"]
-    if low and high:
-        beyond = (high / low) ** 0.5
-        axes.set_xlim(low / beyond, high * beyond)
+    yield "kd", figure_of(plot_kd(found))
 
 
 # ---- A histogram with its gates, for the app -----------------------------------------------------
@@ -346,7 +306,4 @@ def histogram_figure(
 
 def figure_bytes(figure: Figure, kind: Format, *, dpi: int = 300) -> bytes:
     """Write a figure as a file's contents."""
-    buffer = io.BytesIO()
-    with mpl.rc_context(STYLE):
-        figure.savefig(buffer, format=kind, dpi=dpi)
-    return buffer.getvalue()
+    return contents(figure, kind, dpi)

@@ -101,6 +101,7 @@ def test_options_reach_the_library_resolved(library, capsys, tmp_path) -> None:
     assert call["stack"] == Path("data/movie.tif")
     assert call["out"] == Path("data/movie.iscat")
     assert call["overwrite"] is True
+    assert call["figures"] is False
     assert call["command"] == f"iscat-fit data/movie.tif {options}"
     assert config.fit.mode == "mass"
     assert config.fit.frames == (200, 400)

@@ -15,6 +15,7 @@ import iscat_analysis as ia
 from iscat_analysis.camera import CutFrames
 from iscat_analysis.movie import Stack
 from iscat_analysis.pipeline import landings as redraw_module
+from iscat_cli import main
 
 pytestmark = pytest.mark.usefixtures("all_sketched")
 
@@ -108,13 +109,54 @@ def test_tables_and_configuration_are_those_of_the_folder(written) -> None:
     folder, analysed = written["landing"]
     with ia.open_result(str(folder)) as result:
         assert result.mode == "mass"
-        assert result.tracks is None
+        assert result.tracks.empty
+        assert result.analysis.tracks is None
         pd.testing.assert_series_equal(result.table["mass_kda"], analysed.table["mass_kda"])
         assert ia.config_to_toml(result.config) == analysed.config_toml
         assert isinstance(result.view(1), Figure)
         result.close()
         assert result.images(2).contrast.shape  # the movie is opened again
-        assert "mode mass: 4 events: 4 ok; Mass 695 to 1198 kDa" in repr(result)
+        text = " ".join(repr(result).split())
+        assert "StoredResult: 4 events in movie.tif, mode mass Mass 695 to 1198 kDa" in text
+        assert "4 events: 4 ok." in text
+
+
+def test_a_folder_gives_back_what_the_fit_gave(written) -> None:
+    for folder, analysed in written.values():
+        with ia.open_result(folder) as result:
+            pd.testing.assert_frame_equal(result.species, analysed.species)
+            assert result.events.index.tolist() == analysed.events.index.tolist()
+            assert [f.text for f in result.findings] == [
+                f["text"] for f in analysed.summary["findings"]
+            ]
+            assert result.warnings == analysed.warnings
+            assert repr(result).partition(":")[2] == repr(analysed).partition(":")[2]
+            assert len(repr(result).splitlines()) <= 20
+            pd.testing.assert_frame_equal(result.budget, analysed.budget)
+            drawn, again = (each.plot_masses(bins=4).patches for each in (analysed, result))
+            assert [p.get_height() for p in drawn] == [p.get_height() for p in again]
+
+
+def test_figures_are_drawn_from_a_folder_and_events_where_the_movie_is(
+    written, tmp_path, capsys
+) -> None:
+    folder, _ = written["bound"]
+    command = ["figures", "--format", "svg", "--out", str(tmp_path / "paper")]
+    assert main([*command, str(folder)]) == 0
+    names = {Path(line).name for line in capsys.readouterr().out.splitlines()}
+    assert {"field.svg", "masses.svg", "precision.svg", "event_0000.svg", "event_0001.svg"} == names
+    assert {path.name for path in (tmp_path / "paper").iterdir()} == names
+    alone = shutil.copytree(folder, tmp_path / "alone.iscat")
+    summary = (alone / "summary.json").read_text().replace("movie.tif", "gone.tif")
+    (alone / "summary.json").write_text(summary)
+    assert main([*command, str(alone)]) == 1
+    assert "pass --overwrite to replace its figures" in capsys.readouterr().err
+    assert main(["figures", str(alone)]) == 0
+    told = capsys.readouterr()
+    assert "no single event is drawn" in told.err
+    assert {path.name for path in (tmp_path / "alone.figures").iterdir()} == {
+        "field.pdf", "masses.pdf", "precision.pdf",
+    }  # fmt: skip
 
 
 def test_the_movie_is_looked_for_beside_the_folder(written, tmp_path) -> None:

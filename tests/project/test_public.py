@@ -195,17 +195,34 @@ def test_the_text_says_what_was_found(result) -> None:
     text = repr(result)
     assert text.startswith("Result: 2 events in movie.tif, mode mass")
     assert "2 ok" in text
+    assert len(text.splitlines()) <= 20
     assert "CRB" in text
     assert "kDa" in text
     assert max(map(len, text.splitlines())) <= 80
 
 
-def test_the_notebook_table_is_escaped_and_short(result, monkeypatch) -> None:
+def test_the_notebook_says_the_same_and_no_rows(result) -> None:
     page = result._repr_html_()
-    assert page.count("<tr") > 4
-    assert "sigma_mass_kda" in page
-    monkeypatch.setattr(shown, "ROWS_SHOWN", 1)
-    assert "and 1 more" in result._repr_html_()
+    assert "in events that are not alike and too few to tell species" in page
+    assert "2 events: 2 ok." in page
+    assert "<tr" not in page  # two events are no species
+
+
+def test_what_one_types_first_works_or_names_the_nearest(result) -> None:
+    """Control: a name like none of them gets no hint."""
+    for name, near in {
+        "plot_mass": "plot_masses",
+        "hist": "histogram",
+        "specie": "species",
+    }.items():
+        with pytest.raises(AttributeError, match=f"has no '{name}'; did you mean .*{near}"):
+            getattr(result, name)
+    with pytest.raises(AttributeError, match=r"has no 'qqqqqqq'$"):
+        _ = result.qqqqqqq
+    assert len(result.events) == 2
+    assert result.species.empty
+    figure = result.histogram(bins=5)
+    assert len(figure.axes[0].patches) == 5
 
 
 def test_figures_are_matplotlibs_and_draw_themselves(result) -> None:
@@ -249,6 +266,7 @@ def test_nothing_found_is_a_result(movie, config) -> None:
     assert len(blank) == 0
     assert "0 events" in repr(blank)
     assert "0 events" in blank._repr_html_()
+    assert blank.species.empty
     with pytest.raises(ia.DataError, match="no event was found"):
         blank.histogram()
     with pytest.raises(ia.DataError, match="no event was found"):
