@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from iscat_analysis.report.plots import Panels
+    from iscat_analysis.report.vega import VegaFigure
 
 SHOWN_FRAMES = 12
 """Frames around its own in which an event of a landing movie is marked in a film."""
@@ -315,6 +316,34 @@ class MovieResult:
             It shows itself in a notebook.
         """
         return _figure(self.plot_precision())
+
+    def figure(self, name: str) -> VegaFigure:
+        """Give a figure of the result page: its data and its Vega-Lite specification.
+
+        Parameters
+        ----------
+        name : str
+            As ``"masses"``.
+
+        Returns
+        -------
+        VegaFigure
+            A notebook draws it, and it can be saved.
+
+        Raises
+        ------
+        ConfigError
+            There is no such figure; the known ones are named.
+        """
+        known = self._page_figures()
+        if name not in known:
+            raise ConfigError(f"there is no figure {name!r}; known: {', '.join(sorted(known))}")
+        return known[name]
+
+    def _page_figures(self) -> dict[str, VegaFigure]:
+        from iscat_analysis.report.movie_figures import movie_figures
+
+        return movie_figures(self.analysis)
 
     def write_figures(
         self, folder: str | Path, *, formats: tuple[str, ...] = ("png", "svg")
@@ -588,6 +617,11 @@ class StoredResult(MovieResult):
         if not self.table[["x_px", "y_px", "mass_kda"]].iloc[row].notna().all():
             raise DataError(f"{self.folder.name}: row {row} has no place, so there is no image")
         return self._opened[1](row)
+
+    def _page_figures(self) -> dict[str, VegaFigure]:
+        from iscat_analysis.report.vega import figures_in
+
+        return figures_in(self.folder / "report.html")
 
     def write_figures(
         self, folder: str | Path, *, formats: tuple[str, ...] = ("png", "svg")

@@ -7,7 +7,6 @@ Matplotlib's outlasts a call, and none is changed for axes that are given.
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from functools import partial, wraps
@@ -51,6 +50,7 @@ from iscat_analysis.report.answer import (
     track_quantity,
 )
 from iscat_analysis.report.numbers import UNITS, number, parameter
+from iscat_analysis.report.pictures import display_range, residual_limit
 from iscat_analysis.report.style import (
     BLUE,
     DPI,
@@ -62,7 +62,6 @@ from iscat_analysis.report.style import (
     STYLE,
     VERMILLION,
     Style,
-    display_range,
     floats,
     judged,
     new_figure,
@@ -329,7 +328,7 @@ def _draw_precision(axes: Axes, analysis: Analysis, table: pd.DataFrame, name: s
     ):
         if rows.any():
             style: Style = {"ms": 3.5, "mew": mark == "x", "color": color, "label": said}
-            points(axes, crb, values, rows, mark, linked=False, style=style)
+            points(axes, crb, values, rows, mark, style=style)
     axes.set_xlim(*ends)
     plain_log(axes, "x", "y")
 
@@ -357,7 +356,7 @@ def plot_field(analysis: Analysis, *, ax: Axes | None = None) -> Axes:
     else:
         ring: Style = {"mfc": "none", "mec": "#F0E442" if image.size else BLUE, "ms": 11, "mew": 1}
         every = np.ones(len(table), dtype=bool)
-        points(axes, places[:, 0], places[:, 1], every, linked=False, style=ring)
+        points(axes, places[:, 0], places[:, 1], every, style=ring)
         white: Style = {"color": "white", "path_effects": HALO} if image.size else {"color": INK}
         first = table.drop_duplicates("event")[["event", "x_px", "y_px"]].dropna()
         for event, *place in first.head(100).to_numpy(float):
@@ -420,7 +419,7 @@ def plot_tracks(analysis: Analysis, *, ax: Axes | None = None) -> Axes:
             style: Style = {"ls": "none", "elinewidth": 0.7, "alpha": 0.6, "color": color}
             axes.errorbar(sizes[rows], d[rows], bars[:, rows], sigma[rows], **style)
         dots: Style = {"color": color, "ms": 3.5, "mew": 0, "label": name}
-        points(axes, sizes, d, rows, linked=False, style=dots)
+        points(axes, sizes, d, rows, style=dots)
     if not _is_ok(tracks)[usable].all():
         axes.legend(fontsize="small")
     axes.set(xlabel=quantity.axis, ylabel="D [µm²/s]")
@@ -474,15 +473,6 @@ def plot_event(view: EventView, scheme: str, pixel_size_nm: float, *, ax: Any = 
     if view.trace is not None and panels.size == 4:
         draw_trace(panels[3], view.trace)
     return panels
-
-
-def residual_limit(residual: FloatArray) -> float:
-    """Choose the range of a residual image: four standard deviations, more where it needs more.
-
-    Shapes: `residual` (y, x).
-    """
-    values = np.abs(residual[np.isfinite(residual)])
-    return max(4.0, math.ceil(np.quantile(values, 0.995))) if values.size else 4.0
 
 
 def draw_trace(axes: Axes, trace: Trace) -> None:

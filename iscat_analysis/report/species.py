@@ -12,21 +12,10 @@ from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
-from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from iscat_analysis.report.numbers import (
-    fixed,
-    intervals,
-    number,
-    numeric,
-    of,
-    percent,
-    sentence,
-    tabulate,
-)
-from iscat_analysis.report.page import Chart, Section
+from iscat_analysis.report.numbers import number
 from iscat_analysis.report.plots import contents, figure_of, plot_kd
 from iscat_analysis.report.style import (
     BLUE,
@@ -59,59 +48,6 @@ _CORRECTED = ("corrected_low", "corrected_high")
 
 
 # ---- Species of a movie --------------------------------------------------------------------------
-
-
-def distribution_section(found: Mapping[str, Any], figures: Mapping[str, Markup]) -> Section | None:
-    """Lay out a distribution as one section of a page."""
-    if not found["species"]:
-        return None
-    width = found["histogram"]["high_kda"][0] - found["histogram"]["low_kda"][0]
-    caption = (
-        f"Landing and leaving by |mass|, in bins of {width:g} kDa; the species are fitted to the "
-        "events, not to the bins."
-    )
-    columns = (
-        *intervals("mass [kDa]", "mass_kda"),
-        *intervals("width [kDa]", "width_kda", title="beyond the events' measurement errors"),
-        numeric("events", of("count", fixed, 0), "that were seen"),
-        numeric("landing", of("landing", fixed, 0)),
-        numeric("leaving", of("leaving", fixed, 0)),
-        numeric("detected", of("efficiency", percent, 1), "chance to detect such a particle"),
-        *intervals("came", "count_corrected", _CORRECTED, title="and those that were missed"),
-        *intervals("fraction", "fraction", in_percent=True, title="of the particles that came"),
-    )
-    title = f"Species by mass; intervals from {found['draws']} simulated repetitions"
-    return Section(
-        "species",
-        "Species",
-        _lead(found),
-        charts=[Chart("species-figure", "Masses and species", figures["species"], caption, True)],
-        tables=[tabulate(found["species"], columns, title)],
-        notes=[sentence(note) for note in found["notes"]],
-    )
-
-
-def _lead(found: Mapping[str, Any]) -> str:
-    described = [item for item in found["species"] if not item.get("background")]
-    count = sum(not item["outlier"] for item in described)
-    rivals = [row["delta_bic"] for row in found["selection"] if row["species"] != len(described)]
-    text = (
-        f"{count} species explain {found['events']} events best (BIC), fitted to the events "
-        "themselves, each with its own error."
-        if count > 1
-        else f"One species explains {found['events']} events best (BIC)."
-    )
-    if count < len(described):
-        text += " What lies apart from them in one or two events is listed, and is no species."
-    for item in found["species"]:
-        if item.get("background"):
-            share = 100 * item["count"] / found["events"]
-            text += f" {share:.2g} % of the events are background, which is no species."
-    if rivals:
-        text += f" The next best number is worse by {number(min(rivals), 2)}."
-    if (support := found["support"]) is not None and support == support:
-        text += f" In {100 * support:.0f} % of simulated repetitions the same number wins."
-    return text
 
 
 def species_figure(found: Mapping[str, Any]) -> Figure | None:
@@ -153,50 +89,6 @@ def _bars(axes: Axes, bars: Mapping[str, Any], unit: str, label: str) -> float:
     edges = [*low, high[-1]]
     axes.stairs(bars["count"], edges, fill=True, color=GREY, alpha=0.5, label=label)
     return float(high[0] - low[0])
-
-
-def sizes_section(found: Mapping[str, Any], figures: Mapping[str, Markup]) -> Section:
-    """Lay out populations of diameters as one section of a page."""
-    many = len(found["populations"])
-    some = f"{many} log-normal populations of diameters explain"
-    which = some if many > 1 else "One log-normal population of diameters explains"
-    caption = (
-        "Diameters of spheres that were seen. The curve has the errors of the diameters; each bar "
-        "reaches from the median of a population over one geometric standard deviation without "
-        "them."
-    )
-    columns = (
-        *intervals("median diameter [nm]", "diameter_nm"),
-        *intervals("geometric standard deviation", "geometric_sd", title="beyond their errors"),
-        *intervals("fraction", "fraction", in_percent=True, title="of the spheres seen"),
-        numeric("spheres", lambda p: fixed(p["count"], 0) + (", outlier" if p["outlier"] else "")),
-    )
-    name = "Diameters and populations"
-    title = f"Populations by diameter; intervals from {found['draws']} simulated repetitions"
-    return Section(
-        "species",
-        "Sizes",
-        f"{which} {found['spheres']} spheres best (BIC), each with its own error.",
-        charts=[Chart("species-figure", name, figures["sizes"], caption, True)],
-        tables=[tabulate(found["populations"], columns, title)],
-        notes=[sentence(note) for note in found["notes"]],
-    )
-
-
-def sizes_figure(found: Mapping[str, Any]) -> Figure:
-    """Draw the histogram of diameters and the populations."""
-    figure, axes = one_panel(9.6, 3.4)
-    width = _bars(axes, found["histogram"], "nm", "spheres")
-    diameter, model = floats(found["curve"]["diameter_nm"]), width * floats(found["curve"]["model"])
-    axes.plot(diameter, model, color=VERMILLION, lw=1.6, label="populations, with errors")
-    for each in found["populations"]:
-        middle, spread = each["diameter_nm"], each["geometric_sd"]
-        height, ends = np.interp(middle, diameter, model) / 2, (middle / spread, middle * spread)
-        axes.plot(ends, [height] * 2, "|-", color=INK)
-        axes.plot(middle, height, "o", color=INK, ms=4)
-    axes.set(xlabel="diameter [nm]", ylabel=f"spheres per {width:g} nm", ylim=(0, None))
-    axes.legend(loc="best")
-    return figure
 
 
 # ---- Samples and equilibria ----------------------------------------------------------------------

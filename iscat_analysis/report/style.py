@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,11 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from PIL import Image
 
-from iscat_analysis.config import SCHEMES
 from iscat_analysis.records import BoolArray, FloatArray
 
 DPI, PRINT_DPI = 140, 300
@@ -209,20 +207,12 @@ def points(
     rows: BoolArray,
     mark: str = "o",
     *,
-    linked: bool = True,
     style: Style | None = None,
 ) -> None:
-    """Draw points that know the rows of the page's table that they stand for.
-
-    Of more than 800 the page has an image; where the table is of something else they are not
-    `linked`.
-    """
+    """Draw points of some rows; more than 800 as an image."""
     at = np.flatnonzero(rows & np.isfinite(x) & np.isfinite(y))
     (line,) = axes.plot(x[at], y[at], mark, ls="none", **(style or {}))
-    if at.size > 800:
-        line.set_rasterized(True)
-    elif linked:
-        line.set_gid("rows-" + "_".join(map(str, at)))
+    line.set_rasterized(at.size > 800)
 
 
 def judged(
@@ -277,19 +267,6 @@ def picture(
         figure.colorbar(shown, ax=axes, shrink=0.8)
 
 
-def display_range(images: Sequence[Any], scheme: str) -> tuple[float, float]:
-    """Choose the grey scale that images share."""
-    values = np.concatenate([np.ravel(image) for image in images])
-    values = values[np.isfinite(values)]
-    if not values.size:
-        return -1.0, 1.0
-    if not SCHEMES[scheme].interferes:
-        low, high = (float(v) for v in np.quantile(values, [0.002, 0.999]))
-        return (low, high) if high > low else (low, low + 1.0)
-    limit = float(np.quantile(np.abs(values), 0.998))
-    return (-limit, limit) if limit > 0 else (-1.0, 1.0)
-
-
 def scale_bar(axes: Axes, columns: int, rows: int, pixel_size_nm: float) -> None:
     """Draw a scale bar into the lower left corner of an image."""
     bars = [50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000]
@@ -299,34 +276,3 @@ def scale_bar(axes: Axes, columns: int, rows: int, pixel_size_nm: float) -> None
     axes.add_patch(Rectangle((x, y), wide, tall, fc="white", ec="black", lw=0.6, zorder=3))
     text = f"{length_nm / 1000:g} µm"
     axes.text(x, y - 0.015 * rows, text, color="white", fontsize=8, path_effects=HALO, zorder=3)
-
-
-def field_figure(
-    image: FloatArray,
-    scheme: str,
-    pixel_size_nm: float,
-    *,
-    bright: float = 1.0,
-    style: Style | None = None,
-) -> tuple[Figure, Axes, AxesImage]:
-    """Draw a field of view.
-
-    The pixels of a field that is more than five times as long as wide are stretched, because
-    nothing could be recognised otherwise.
-    """
-    rows, columns = image.shape
-    true = rows / columns
-    drawn = float(np.clip(true, 1 / 5, 5))
-    across, tall = 5.2, float(np.clip(5.2 * drawn, 1.0, 7.5))  # inches; the rest is for words
-    figure = new_figure(across + 1.0, tall + 0.5 + (0.0 if drawn == true else 0.25))
-    axes = figure.add_subplot()
-    if drawn != true:
-        stretch = "tall as wide" if drawn > true else "wide as tall"
-        times = max(drawn / true, true / drawn)
-        axes.set_title(f"pixels are drawn {times:.2g} times as {stretch}", fontsize=8)
-    low, high = display_range([image], scheme)
-    greys: Style = {"cmap": "gray", "vmin": bright * low, "vmax": bright * high}
-    shown = axes.imshow(image, aspect=drawn / true, **greys, **(style or {}))
-    scale_bar(axes, columns, rows, pixel_size_nm)
-    axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xlabel="x [px]", ylabel="y [px]")
-    return figure, axes, shown

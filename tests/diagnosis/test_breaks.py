@@ -20,7 +20,6 @@ from iscat_analysis.diagnosis.frames import channels_of
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline.finish import look_at
-from iscat_analysis.report.figures import movie_figure
 from iscat_analysis.schemas.fit import LeftOut, Timeline
 from iscat_analysis.study import Movie
 
@@ -123,10 +122,10 @@ def test_a_break_is_named_left_out_and_the_rest_is_right(
     assert sum(timeline["events"]["ok"]) == len(found)
     for model, said in ((LeftOut, left_out), (Timeline, timeline)):
         assert model.model_validate(said).model_dump(mode="json") == said
-    figure = movie_figure(result.analysis)
-    rows = [axes.get_ylabel().split("\n")[0].strip(",") for axes in figure.axes]
-    assert rows == ["light", "noise", "focus", "drift", "events"]
-    assert {axes.get_xlim() for axes in figure.axes} == {(0.0, FRAMES)}  # one axis
+    course = result.figure("course").data["course"]
+    rows = dict.fromkeys(name.split()[0].strip(",") for name in course["series"])
+    assert list(rows) == ["light", "noise", "focus", "drift", "events"]
+    assert 0 <= min(course["frame"]) < max(course["frame"]) <= FRAMES
 
 
 def test_frames_are_left_out_where_somebody_says() -> None:

@@ -133,6 +133,10 @@ def test_a_folder_gives_back_what_the_fit_gave(written) -> None:
             assert repr(result).partition(":")[2] == repr(analysed).partition(":")[2]
             assert len(repr(result).splitlines()) <= 20
             pd.testing.assert_frame_equal(result.budget, analysed.budget)
+            masses = analysed.figure("masses").data["bars"]
+            assert result.figure("masses").data["bars"] == masses
+            with pytest.raises(ia.ConfigError, match=r"no figure 'mass'; known: .*masses"):
+                result.figure("mass")
             drawn, again = (each.plot_masses(bins=4).patches for each in (analysed, result))
             assert [p.get_height() for p in drawn] == [p.get_height() for p in again]
 

@@ -285,10 +285,14 @@ def test_several_species_are_one_answer_everywhere_and_have_no_median(
     values = " · ".join(number(factor * mass) for mass in masses)
     answer = f"Species of {quantity} {values}{unit}"
     page = (out / "report.html").read_text(encoding="utf-8")
-    shown = " ".join(repr(Result(analysis)).split()), repr(open_result(out))
+    shown = repr(Result(analysis)), repr(open_result(out))
     assert page.count("<tr data-species") == 3
-    for text in (*shown, answer_in(out), headline(analysis, analysis.table)[0]):
+    for text in (answer_in(out), headline(analysis, analysis.table)[0]):
         assert answer in text
+    for text in shown:
+        assert f"{quantity} ± σ{unit and ' [kDa]'}" in text
+        listed = [float(line.split()[0]) for line in text.splitlines()[2:5]]
+        assert listed == pytest.approx([factor * mass for mass in masses], rel=0.01)
     for text in (page, *shown):
         assert "Median mass" not in text
         assert "Median contrast" not in text
@@ -318,7 +322,7 @@ def test_side_lobes_are_no_events() -> None:
     sides = analysis.table.replace({"status": {"poor_fit": "sidelobe"}})
     shown = repr(Result(replace(analysis, table=sides)))
     assert shown.startswith("Result: 10 events in ")
-    assert "status 10 events: 10 ok; further rows, which are no events: 30 sidelobe" in shown
+    assert "10 events: 10 ok; further rows, which are no events: 30 sidelobe." in shown
     assert tally(sides) == (10, {"ok": 10}, {"sidelobe": 30})
 
 

@@ -120,7 +120,7 @@ def test_a_result_shows_its_tracks() -> None:
     result = Result(make_analysis(40, "track"))
     assert "4 tracks of 40 positions" in repr(result)
     assert ".tracks" in repr(result)
-    assert "d_um2_s" in result._repr_html_()
+    assert "4 tracks of 40 positions" in result._repr_html_()
     assert len(result.tracks) == 4
     assert list(Result(make_analysis(3)).tracks.columns) == list(TRACK_COLUMNS)
     assert result.overview() is not None
