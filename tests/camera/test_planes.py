@@ -121,7 +121,6 @@ def test_particles_at_many_heights_are_not_taken_for_a_membrane(mover: dict[str,
 
 
 @pytest.mark.large
-@pytest.mark.usefixtures("sketched")
 def test_a_movie_of_a_membrane_says_so() -> None:
     """Its heights were free: of all fits nearly none was described, and the optics were blamed."""
     config, movie = _moving(seed=2, exposure_ms=2.5, d_um2_s=0.8)

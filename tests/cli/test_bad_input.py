@@ -74,7 +74,6 @@ def _listing(folder: Path) -> dict[str, int]:
     }
 
 
-@pytest.mark.usefixtures("sketched")
 def test_the_movie_of_these_tests_is_good_and_its_result_is_kept(
     refused: Run, movie: Path, capsys
 ) -> None:
@@ -177,7 +176,6 @@ def test_a_pixel_without_a_number_in_every_frame(
     assert "frame 0 is NaN or infinite in 1 pixel, the first at y = 20, x = 9" in line
 
 
-@pytest.mark.usefixtures("sketched")
 def test_a_zero_frame_is_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _with(7, 0, "u2")(tmp_path / "dropped.tif")
     assert main_fit([str(tmp_path / "dropped.tif"), *GOOD, *NONE]) == 0

@@ -245,7 +245,6 @@ def test_an_interrupted_question_writes_nothing(imagej: Path, monkeypatch, capsy
     assert not imagej.with_name("iscat.toml").exists()
 
 
-@pytest.mark.usefixtures("sketched")
 def test_fit_finds_the_file_beside_the_movie(plain: Path, tmp_path: Path, capsys) -> None:
     assert main(["init", str(plain), "--yes", "--pixel-size-nm=84", "--na=1.4", "--quiet"]) == 0
     capsys.readouterr()

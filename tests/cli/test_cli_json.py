@@ -21,8 +21,6 @@ from iscat_analysis.records import EVENT_COLUMNS, EVENTS, Status
 from iscat_analysis.schemas import schema, schema_names
 from iscat_cli import main
 
-pytestmark = pytest.mark.usefixtures("all_sketched")
-
 
 def _check(value: Any, name: str) -> None:
     jsonschema.Draft202012Validator(schema(name)).validate(value)

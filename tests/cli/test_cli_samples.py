@@ -19,8 +19,6 @@ from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, REPEAT_COLUMN
 from iscat_analysis.schemas import schema
 from iscat_cli import main, main_fit
 
-pytestmark = pytest.mark.usefixtures("all_sketched")
-
 MODES = ["mass", "localize", "joint"]
 
 # Standard errors: of 8 events times 4 parameters, one beyond 5σ has a probability below 2e-5.

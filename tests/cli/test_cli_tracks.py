@@ -13,8 +13,6 @@ import tifffile
 from iscat_analysis import schema, simulate_movie
 from iscat_cli import main
 
-pytestmark = pytest.mark.usefixtures("sketched")
-
 RATE_HZ = 331.0
 SETUP = """
 [optics]

@@ -149,7 +149,6 @@ def test_what_a_killed_run_left_is_removed(tmp_path: Path, kind: str) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
 
 
-@pytest.mark.usefixtures("sketched")
 def test_finished_parts_are_removed_and_nothing_else(tmp_path: Path) -> None:
     simulate(tmp_path / "movie.tif", seed=1)
     parts = tmp_path / ".movie.iscat.partial"

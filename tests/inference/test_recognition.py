@@ -149,8 +149,7 @@ def movie(path: Path, large: bool) -> list[tuple[float, float]]:
 
 
 @pytest.mark.large
-def test_proteins_beside_a_large_particle_are_as_without_it(tmp_path: Path, sketched: None) -> None:
-    del sketched
+def test_proteins_beside_a_large_particle_are_as_without_it(tmp_path: Path) -> None:
     tables = []
     for large in (True, False):
         path = tmp_path / f"{large}.tif"

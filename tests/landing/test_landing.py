@@ -557,7 +557,6 @@ def movie(counts: np.ndarray, tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.usefixtures("sketched")
 def test_an_interrupted_run_resumes_to_the_same_result(
     movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -701,7 +700,6 @@ def test_without_a_pattern_there_is_nothing_to_correct() -> None:
     assert any("no fixed pattern" in line for line in told)
 
 
-@pytest.mark.usefixtures("sketched")
 def test_chains_reach_the_report(movie: Path, tmp_path: Path) -> None:
     config = _config("posterior.enabled=true", "posterior.steps=300", "fit.frames=[40, 135]")
     out = tmp_path / "sampled.iscat"
@@ -741,7 +739,6 @@ def _interrupted_at_the_second_chunk(monkeypatch: pytest.MonkeyPatch) -> list[in
     return calls
 
 
-@pytest.mark.usefixtures("sketched")
 def test_an_interrupted_injection_keeps_what_the_movie_gave(
     movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

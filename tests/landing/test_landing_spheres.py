@@ -47,7 +47,6 @@ def config_of(**keys: object) -> Config:
     )  # fmt: skip
 
 
-@pytest.mark.usefixtures("sketched")
 def test_neighbours_are_as_large_as_they_are(tmp_path: Path) -> None:
     """Without the product of fields both are 6 standard errors too small, and no fit is good.
 
@@ -64,7 +63,6 @@ def test_neighbours_are_as_large_as_they_are(tmp_path: Path) -> None:
 
 
 @pytest.mark.large
-@pytest.mark.usefixtures("sketched")
 def test_the_index_of_a_sphere_that_lands_is_fitted(tmp_path: Path) -> None:
     movie = tmp_path / "movie.tif"
     write_stack(config_of(), movie, seed=2)
@@ -101,7 +99,6 @@ def test_what_lands_is_no_flicker_and_no_motion(seed: int) -> None:
     assert measure_motion(counts, Camera(), 40) < 0.01
 
 
-@pytest.mark.usefixtures("sketched")
 def test_spheres_are_given_up_where_none_describes_the_brightest_steps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -42,7 +42,6 @@ class Judged(StepMaps):
 CALLS: list[tuple[int, float, float]] = []
 
 
-@pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize(
     "heaviest", [480.0, pytest.param(3000.0, marks=pytest.mark.large)], ids=["weak", "strong"]
 )

@@ -24,8 +24,6 @@ from iscat_analysis.records import (
 )
 from iscat_analysis.study import write_stack
 
-pytestmark = pytest.mark.usefixtures("all_sketched")
-
 SIGMAS = 4.0
 # Smaller tests look at some 60 pulls together: one beyond 5 is a chance of 3e-5.
 FAR = 5.0

@@ -17,8 +17,6 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.pipeline import landings as redraw_module
 from iscat_cli import main
 
-pytestmark = pytest.mark.usefixtures("all_sketched")
-
 IMAGE_ATOL = 1e-4
 """Of a contrast, whose peaks here exceed 0.01 and whose noise is 1e-3: the neighbours of a fit move
 by a part of their errors when the last sweep ends."""

@@ -273,7 +273,6 @@ def test_nothing_found_is_a_result(movie, config) -> None:
         blank.view(0)
 
 
-@pytest.mark.usefixtures("sketched")
 def test_saving_is_the_command_lines(result, movie, config, tmp_path) -> None:
     folder = result.save(str(tmp_path / "kept"))
     assert (folder / "report.html").is_file()

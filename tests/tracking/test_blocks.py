@@ -47,8 +47,6 @@ from iscat_analysis.tracking.rows import Localizations
 from iscat_analysis.tracking.stages import find_rows_and_background
 from iscat_analysis.tracking.table import common_masses, moving_table, table_of_tracks
 
-pytestmark = pytest.mark.usefixtures("sketched")
-
 SHAPE = (120, 40, 40)
 SPECIES = ((400.0, 0.15, 1), (300.0, 0.4, 1))
 NEAR_NM = 300.0

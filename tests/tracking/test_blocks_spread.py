@@ -10,7 +10,7 @@ from wanderers import SETTINGS, Wanderers, wander
 
 import iscat_analysis as ia
 
-pytestmark = [pytest.mark.usefixtures("sketched"), pytest.mark.large]
+pytestmark = pytest.mark.large
 
 DRIFT_NM = 0.03  # a frame, 10 nm/s: 6 nm in all
 SPECIES = ((400.0, 0.15, 2), (200.0, 0.8, 1))

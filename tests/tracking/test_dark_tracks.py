@@ -40,7 +40,6 @@ def _written(folder: Path, seed: int) -> tuple[Path, float]:
     return path, float(truth["mass_kda"].iloc[0])
 
 
-@pytest.mark.usefixtures("sketched")
 def test_dark_field_tracks_need_no_frames_before(tmp_path: Path) -> None:
     """The median of all frames has much of a particle that goes no farther than it is wide."""
     path, mass = _written(tmp_path, 1)

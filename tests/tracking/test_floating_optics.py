@@ -11,8 +11,6 @@ from instruments import Instrument
 import iscat_analysis as ia
 from iscat_analysis.tracking.optics import REJECTED_SHARE
 
-pytestmark = pytest.mark.usefixtures("sketched")
-
 FRAMES, SIDE_PX, CEILING_NM = 30, 56, 600.0
 SPHERICAL_NM = 20.0
 SETTINGS: dict[str, Any] = {

@@ -704,7 +704,6 @@ def test_links_of_a_crowd_are_refused(count: int, apart: float) -> None:
 # ---- the whole job ---------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("sketched")
 def test_raw_movie_becomes_tracks(tmp_path: Path) -> None:
     paths = _paths(40.0)
     counts, _, _ = _movie(paths, noise=True)
@@ -738,7 +737,6 @@ def test_too_few_frames_are_refused(tmp_path: Path) -> None:
         fit_stack(movie, _config())
 
 
-@pytest.mark.usefixtures("sketched")
 def test_an_empty_movie_has_no_tracks(tmp_path: Path) -> None:
     """The frame rate is not needed for that, nor for the blur of a whole frame."""
     movie = tmp_path / "movie.tif"

@@ -33,8 +33,6 @@ from iscat_analysis.tracking.optics import (
     mass_error,
 )
 
-pytestmark = pytest.mark.usefixtures("sketched")
-
 SHAPE = (120, 80, 80)
 MASS_KDA = 400.0
 

@@ -27,8 +27,6 @@ from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.records import TRACK_COLUMNS, Analysis
 from iscat_analysis.tracking.tracks import mass_correlation
 
-pytestmark = pytest.mark.usefixtures("all_sketched")
-
 BEFORE, FRAMES, LEVEL_E, SIGMAS = 60, 30, 1e5, 4.0
 SHAPE = (60, 76)
 RATE_HZ = 331.0
@@ -73,9 +71,8 @@ def movie(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def found(movie: tuple[Path, np.ndarray], all_sketched: None) -> Analysis:
+def found(movie: tuple[Path, np.ndarray]) -> Analysis:
     """Follow them."""
-    del all_sketched
     return fit_stack(movie[0], _config())
 
 

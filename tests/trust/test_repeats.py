@@ -349,7 +349,6 @@ def _measured(ratio: float, message: str = ""):
     return replace(analysis, summary=summary)
 
 
-@pytest.mark.usefixtures("sketched")
 def test_the_page_shows_what_was_measured() -> None:
     page = render_report(_measured(1.02))
     assert "1.02 (0.97 to 1.07) times the Cramér–Rao bound" in page

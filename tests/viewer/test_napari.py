@@ -22,10 +22,7 @@ import tifffile
 import iscat_analysis as ia
 
 # napari and npe2 describe their manifests and settings in an old manner of pydantic's.
-pytestmark = [
-    pytest.mark.filterwarnings("ignore::pydantic.warnings.PydanticDeprecatedSince20"),
-    pytest.mark.usefixtures("all_sketched"),
-]
+pytestmark = [pytest.mark.filterwarnings("ignore::pydantic.warnings.PydanticDeprecatedSince20")]
 
 PLUGIN, WINDOW = "iscat-analysis", 24
 SETTINGS = {
