@@ -120,7 +120,7 @@ def test_fits_meet_the_truth(mode: str, fitted, movies) -> None:
 @pytest.mark.parametrize("mode", MODES)
 def test_the_folder_is_complete_and_follows_the_schemas(mode: str, fitted) -> None:
     names = {path.name for path in fitted[mode].iterdir()}
-    expected = {"fits.csv", "fits.parquet", "summary.json", "config.toml", "report.html", "figures"}
+    expected = {"fits.csv", "fits.parquet", "summary.json", "config.toml", "report.html"}
     assert expected <= names
     assert "posterior.nc" not in names
     _check(_read(fitted[mode] / "summary.json"), "summary")

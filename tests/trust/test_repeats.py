@@ -351,10 +351,9 @@ def _measured(ratio: float, message: str = ""):
 
 def test_the_page_shows_what_was_measured() -> None:
     page = render_report(_measured(1.02))
-    assert "1.02 (0.97 to 1.07) times the Cramér–Rao bound" in page
-    assert "measured / CRB" in page
-    assert 'id="spread-figure"' in page
-    assert "measured / CRB" not in render_report(make_analysis(40))
+    assert "Errors are right: the measured spread is 1.02 (0.97 to 1.07) times the bound" in page
+    assert 'data-figure="spread"' in page
+    assert "Errors are right" not in render_report(make_analysis(40))
 
 
 def test_understated_errors_are_never_shown_without_the_line() -> None:
