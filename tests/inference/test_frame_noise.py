@@ -204,6 +204,6 @@ def test_the_page_says_how_the_spread_of_tracks_was_measured() -> None:
     said = headline(analysis, analysis.table)
     assert any("of single frames where there is no particle, is 1.02" in line for line in said)
     page = render_report(analysis)
-    assert "between successive frames" in page.lower()
+    assert "Of single frames, where there is no particle" in page
     assert "frames since the background" in page
-    assert "parts of the events" not in page
+    assert "parts of the particles' own frames" not in page
