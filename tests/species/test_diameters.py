@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from markupsafe import Markup
 
 import iscat_analysis as ia
 from iscat_analysis.findings.tables import TWO_STANDARDS
 from iscat_analysis.pipeline.finish import sizes_of_tracks
 from iscat_analysis.records import FloatArray
-from iscat_analysis.report.species import sizes_figure, sizes_section
 from iscat_analysis.species.diameters import describe_sizes
 from iscat_analysis.units import sphere_mass_kda
 
@@ -75,9 +73,6 @@ def test_two_populations_have_fractions_intervals_and_a_common_error() -> None:
     drawn = sizes.to_dict()
     step = np.diff(drawn["curve"]["diameter_nm"])[0]
     assert np.sum(drawn["curve"]["model"]) * step == pytest.approx(225, rel=0.01)
-    section = sizes_section(drawn, {"sizes": Markup()})
-    assert section.lead.startswith("2 log-normal populations of diameters")
-    assert sizes_figure(drawn).axes[0].get_xlabel() == "diameter [nm]"
 
 
 def test_what_tells_nothing_is_left_out_and_said() -> None:
