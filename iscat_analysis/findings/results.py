@@ -16,8 +16,7 @@ NOT_A_MASS = caution(
 )
 
 MANY_FLAGGED = caution(
-    "many-flagged",
-    "{rows} flagged, so no median is given{rest}. The commonest reason is {reason}. {advice}",
+    "many-flagged", "{rows} flagged{rest}. The commonest reason is {reason}. {advice}"
 )
 
 MODEL_REJECTED = caution(

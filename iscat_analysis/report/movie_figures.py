@@ -71,6 +71,8 @@ PICTURE_PX = 560
 """Longest side of a field on the screen."""
 MOST_PATH_POINTS = 20_000
 """Points of paths on a page; of more, some are left out."""
+RINGS = ((200, 240), (1000, 90), (math.inf, 20))
+"""Sizes of rings around so many particles at most, so that the field is seen between them."""
 MOST_ERRORS = 400
 """Tracks whose errors are drawn beside their dots."""
 MSD_PART = 4
@@ -506,7 +508,7 @@ def _picture(sample: Sample, bright: float) -> tuple[dict[str, list[Any]], dict[
         "height": round(tall),
         "columns": [-0.5, columns - 0.5],
         "rows": [-0.5, rows - 0.5],
-        "ring": 240,
+        "ring": next(size for most, size in RINGS if len(sample.rows) <= most),
         "caption": f"A pixel is {number(sample.analysis.pixel_size_nm)} nm.",
     }
     return columns_of([picture]), words

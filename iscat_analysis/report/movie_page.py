@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import PurePath
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -83,6 +84,8 @@ _REMARKS = {
 }
 
 
+REMEDY_LETTERS = 130
+"""Longest remedy on the first screen; the whole sentence stands among the findings."""
 MUCH_NOISE = 0.2
 """Share by which the variance may differ from the light's before it is doubted."""
 
@@ -120,7 +123,7 @@ def page_context(analysis: Analysis, figures: Mapping[str, VegaFigure]) -> dict[
         "footer": f"iscat-analysis {analysis.provenance.versions.get('iscat-analysis', '')}",
         "answer_title": sample.quantity.label.capitalize() if len(sample.rows) else "Nothing found",
         "answer_axis": sample.quantity.axis,
-        "counts": tally(sample.rows).text(kind.noun),
+        "counts": f"{count(len(sample.rows), kind.noun)}, {int(sample.is_ok.sum())} ok",
         "species": _species_table(sample),
         "facts": [] if sample.species else _facts(sample),
         "trust": trust(sample),
@@ -280,7 +283,9 @@ def trust(sample: Sample) -> list[Trust]:
         ]
         if doubts:
             first = doubts[0]
-            lines.append(Trust(subject, first.severity, *first.brief, len(doubts) - 1))
+            text, remedy = first.brief
+            remedy = shorten(remedy, REMEDY_LETTERS, placeholder=" …")
+            lines.append(Trust(subject, first.severity, text, remedy, len(doubts) - 1))
         elif (line := reassure(sample)) is not None:
             lines.append(line)
     ranks = list(Severity)

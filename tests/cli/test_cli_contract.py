@@ -159,7 +159,7 @@ def test_the_table_of_events_is_plain(printed) -> None:
     rows = _row(0), _row(1, "at_bound", "at_bound")
     captured = printed(*rows, options=("--events=9",))
     warned, heading, first, second, *last = captured.out.splitlines()
-    assert warned.startswith("1 of 2 events are flagged, so no median is given")
+    assert warned.startswith("1 of 2 events are flagged")
     assert Status.AT_BOUND.advice.rstrip(".") in warned
     assert "\x1b" not in captured.out
     assert all(word in heading for word in ("event", "x ± σ", "CRB mass", "QCRB mass", "status"))

@@ -248,7 +248,7 @@ def test_no_headline_when_more_than_a_fifth_is_flagged(flagged: int, silent: boo
     assert (Status.POOR_FIT.advice in first) == silent
     assert "×10⁹" not in " ".join(headline(analysis, event_table(analysis)))
     alone = with_flagged(make_analysis(1), 1)
-    assert headline(alone, event_table(alone))[0].startswith("The only event is flagged, so")
+    assert headline(alone, event_table(alone))[0].startswith("The only event is flagged. The")
 
 
 @pytest.mark.usefixtures("sketched")
@@ -426,7 +426,7 @@ def test_no_field_is_drawn_as_a_line(shape: tuple[int, int]) -> None:
     spec = movie_figures(analysis)["field"].specification
     assert min(spec["width"], spec["height"]) >= 60
     assert max(spec["width"], spec["height"]) <= PICTURE_PX
-    across = spec["layer"][1]["encoding"]["x"]["scale"]["domain"]
+    across = spec["layer"][0]["encoding"]["x"]["scale"]["domain"]
     assert across == [-0.5, shape[1] - 0.5]
 
 
