@@ -245,8 +245,13 @@ class Sample:
         return is_uncalibrated(self.analysis) and "contrast" in self.fits
 
     def precision_of(self, name: str) -> Precision:
-        """Set σ of one parameter beside its bounds."""
-        return precision_of(self.analysis, self.scaled(counted(self.fits)), name)
+        """Set σ of one parameter beside its bounds, on the scale of the main quantity."""
+        table = counted(self.fits)
+        found = precision_of(self.analysis, self.scaled(table), name)
+        if self.unit(name) == UNITS[name]:
+            return found
+        whole = precision_of(self.analysis, table, name)  # Holevo's bound is that of the mass
+        return replace(found, holevo=whole.holevo * found.crb / whole.crb)
 
     def unit(self, name: str) -> str:
         """Give the unit of a parameter on the scale of the main quantity."""

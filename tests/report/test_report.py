@@ -26,6 +26,7 @@ from iscat_analysis.report.answer import answer_in, answers, headline, precision
 from iscat_analysis.report.movie_figures import (
     CREDIBLE_LEVELS,
     PICTURE_PX,
+    Sample,
     bin_width,
     credible_shades,
     movie_figures,
@@ -460,3 +461,19 @@ def test_what_was_injected_is_told(further: tuple[float, ...], words: str) -> No
     assert line.startswith("Of 20 landings and leavings added to the movie, 19 were found again.")
     assert "Every particle stayed at least 120 frames." in line
     assert words in line
+
+
+def test_bounds_of_a_diameter_have_its_unit() -> None:
+    """Holevo's bound is known of the mass alone."""
+    analysis = make_analysis(40, "joint")
+    table = analysis.table.assign(status="ok")
+    for kind in ("sigma", "crb", "qcrb"):
+        table[f"{kind}_diameter_nm"] = table[f"{kind}_mass_kda"] / 50
+    medians = {"holevo_median": 3.0, "information_fraction_median": 0.5}
+    precision = {**analysis.summary.get("precision", {}), "mass_kda": medians}
+    sized = replace(analysis, mode="size", table=table.assign(diameter_nm=100.0))
+    sample = Sample(replace(sized, summary={**analysis.summary, "precision": precision}))
+    whole, found = (one.precision_of("mass_kda") for one in (Sample(analysis), sample))
+    assert sample.parameter("mass_kda") == "diameter [nm]"
+    assert found.holevo == pytest.approx(3.0 / 50)
+    assert found.crb == pytest.approx(whole.crb / 50, rel=0.05)
