@@ -439,35 +439,31 @@ class FieldSample:
         """Give the camera of the squares."""
         return camera.mapped(self.taken)
 
-    def scatter(self, counts: NDArray[Any], camera: Camera) -> tuple[float, float]:
-        """Noise between neighbouring frames over that of the light, and its standard error.
+    def summary(self, counts: NDArray[Any], camera: Camera) -> dict[str, Any]:
+        """Give what ``summary.json`` says of it.
 
-        The error follows from the scatter of the squares.
+        That is the noise between neighbouring frames over that of the light, and its standard error
+        by the scatter of the squares.
 
         Shapes: `counts` (t, 256, 256), `camera` that of the squares.
         """
-        electrons = camera.steady(counts)
-        if electrons is None:
-            return math.nan, math.nan
-        noise = np.square(np.diff(electrons, axis=0)).mean(axis=0) / 2
-        light = electrons.mean(axis=0) + camera.read_variance_e2((_SIDE * _ALONG, _SIDE * _ALONG))
-        each, expected = (
-            image.reshape(_ALONG, _SIDE, _ALONG, _SIDE).mean(axis=(1, 3)).ravel()
-            for image in (noise, light)
-        )
-        ratio = each / expected
-        return float(ratio.mean()), float(ratio.std(ddof=1) / math.sqrt(ratio.size))
-
-    def summary(self, ratio: float, error: float) -> dict[str, Any]:
-        """Give what ``summary.json`` says of it."""
+        ratio, electrons = np.full(2, np.nan), camera.steady(counts)
+        if electrons is not None:
+            noise = np.square(np.diff(electrons, axis=0)).mean(axis=0) / 2
+            light = electrons.mean(axis=0) + camera.read_variance_e2(noise.shape)
+            each, expected = (
+                image.reshape(_ALONG, _SIDE, _ALONG, _SIDE).mean(axis=(1, 3)).ravel()
+                for image in (noise, light)
+            )
+            ratio = each / expected
         return {
             "pixels": _SIDE**2 * len(self.corners),
             "of": math.prod(self.shape),
             "side_px": _SIDE,
             "corners_px": [list(corner) for corner in self.corners],
             "seed": 1,
-            "noise_ratio": ratio,
-            "noise_ratio_se": error,
+            "noise_ratio": float(ratio.mean()),
+            "noise_ratio_se": float(ratio.std(ddof=1) / math.sqrt(ratio.size)),
         }
 
 

@@ -385,7 +385,7 @@ def survey_noise(reader: Reader, config: Config) -> NoiseSurvey:
         opening, curve, window = judge_window(judged, config)
         whole = None
         if field is not None:
-            sample = field.summary(*field.scatter(opening[:_GAIN_FRAMES], judged.camera))
+            sample = field.summary(opening[:_GAIN_FRAMES], judged.camera)
             frames = whole_frames(reader.shape, SPECTRUM_FRAMES)
             counts = reader.read(reader.first, min(reader.first + frames, reader.last))
             whole = counts[good_frames(counts, reader.camera)], reader.camera
