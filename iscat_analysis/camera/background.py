@@ -3,8 +3,6 @@
 Raw photoelectrons are summed, never rescaled frames, so the sums stay Poisson and the conditional
 likelihood stays exact; the power enters only through ρ, total power after over before.
 
-Pixels that are left out: under a text that was burnt in, and with noise that is not light's.
-
 Text that was burnt into the frames, as a time that goes on: found, and left out.
 
 Ink is one count, again and again, far from what the light of its pixel is: light scatters, and what

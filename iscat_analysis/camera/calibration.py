@@ -1,14 +1,4 @@
-"""Mean and variance of every pixel of a stack, and pixels that are left out of them.
-
-Mean and variance of every pixel of a stack, and its response to the laser.
-
-Pixels that cannot be used: saturated, dead, hot, blinking.
-
-From moments to numbers of the camera: variance against mean, and the zero of the light.
-
-Results of photon transfer: numbers with standard errors, curves, masks, a verdict.
-
-The camera from its own noise: gain, offset and read noise by photon transfer.
+"""The camera from its own noise: gain, offset and read noise by photon transfer.
 
 A pixel of gain g [e/count], offset o [counts] and read noise σ_r [e] that receives μ photoelectrons
 per frame has the mean m = o + μ/g and the variance

@@ -10,8 +10,6 @@ Noise that is not the light's: a fixed pattern that shakes, or counts that are t
 
 In variance against mean, both look like a wrong gain.
 
-Metadata of a movie, and whether its noise agrees with them.
-
 The noise of ratio images at every spatial frequency, measured, and the filter that whitens it.
 
 Shot noise is alike at all frequencies, and of known size.  Charge that leaks between pixels,

@@ -1,6 +1,4 @@
-"""Photon transfer of one movie, and where its light ends.
-
-Photon transfer of one movie: noise and response to the laser, against the light.
+"""Photon transfer of one movie: noise and response to the laser, against the light.
 
 Pixels of one movie have different light.  The variance between frames and the slope against the
 laser power are measured for each pixel, and averaged over pixels of like brightness.
@@ -24,8 +22,6 @@ field its pixels tell o (see `transfer`); where it is even, frames do, as the la
 Where the laser is steady as well nothing tells o, but what was done to the movie may still show:
 its noise is uneven as the background was, although its light is even, or its mean is smoother than
 the noise of its frames allows.
-
-Which law the counts of a movie follow, and the curve that linearises them.
 
 Which law the counts of a movie follow: a line, a wrong offset, gamma, saturation, other light.
 

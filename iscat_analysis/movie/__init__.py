@@ -16,7 +16,6 @@ from iscat_analysis.movie.addresses import MARK, path_beside, setup_beside, spli
 from iscat_analysis.movie.arrays import MappedFrames, bytes_are_swapped
 from iscat_analysis.movie.descriptions import measure_clock
 from iscat_analysis.movie.formats import (
-    FORMATS,
     SUFFIXES,
     files_of,
     find_movies,

@@ -1,10 +1,10 @@
-"""Movies in the files of Nikon and Zeiss, which packages of the field read: nd2 and pylibCZIrw.
-
-Where frames were not written, both give zeros; a frame without any light is refused here.
-
-The formats of movies: how each is told and opened, and which movies a folder holds.
+"""The formats of movies: how each is told and opened, and which movies a folder holds.
 
 `FORMATS` is the one list: `open_stack`, `iscat batch` and the app take from it what a movie is.
+
+Movies in the files of Nikon and Zeiss, which packages of the field read: nd2 and pylibCZIrw.
+
+Where frames were not written, both give zeros; a frame without any light is refused here.
 """
 
 from __future__ import annotations

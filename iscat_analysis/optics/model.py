@@ -1,15 +1,4 @@
-"""Mass and the amplitude of the scattered field: by the absolute model, or by a calibration.
-
-A particle of mass m scatters a field of amplitude a, in any microscope.  The contrast of this
-amplitude, C = L·a + Q·a², depends on the optics: L and Q depend on focus, aperture, phase and
-height.  The line of a calibration was measured with the optics of its standards, so that
-
-    gradient·m + sign(m)·offset = L_there·a + Q_there·a²
-
-gives the mass of an amplitude that was fitted with any other optics.  For faint particles this is
-the gradient times the contrast per kDa of the model here over that of the model there.
-
-Expected images of one particle, and their derivatives.
+"""Expected images of one particle, and their derivatives.
 
 Simulation, fits, posterior and bounds all use `ForwardModel`.  Its *signal* is
 the contrast C in the interferometric schemes and |E_sca|² for unit incident amplitude in dark field
@@ -32,6 +21,17 @@ both axes together, from the eigenvalues (2/π²n²) D E of Brownian motion abou
 
 For the scattered light |e|² the square of the averaged field is used, which is too small by
 q |∇e|².  This is a small part of |e|², which is itself a small part of the contrast of a protein.
+
+Mass and the amplitude of the scattered field: by the absolute model, or by a calibration.
+
+A particle of mass m scatters a field of amplitude a, in any microscope.  The contrast of this
+amplitude, C = L·a + Q·a², depends on the optics: L and Q depend on focus, aperture, phase and
+height.  The line of a calibration was measured with the optics of its standards, so that
+
+    gradient·m + sign(m)·offset = L_there·a + Q_there·a²
+
+gives the mass of an amplitude that was fitted with any other optics.  For faint particles this is
+the gradient times the contrast per kDa of the model here over that of the model there.
 """
 
 from __future__ import annotations

@@ -1,4 +1,16 @@
-"""The pupil of the microscope and its effect on the scattered light (microscope.md, section 2).
+"""The scattered field around one particle, per unit amplitude and over the reference.
+
+Two tables have the same interface.  If only the polarisation gives the pupil a direction, it has a
+`RadialField`: quintics along r.  Any other pupil has a `LatticeField`.  Both give the kernels a
+profile at a height, a table of profiles along z, and the field at any point.
+
+Derivatives with respect to the microscope are analytic.  Every parameter of the optics changes the
+light of each ray in the pupil.  The derivative of the field is the integral of this change: a
+factor inside the pupil, and the light on an edge that moves (aperture, mask).  Each derivative is
+tabulated on the lattice of the field, once for each height, and combined with the field at the
+pixels.
+
+The pupil of the microscope and its effect on the scattered light (microscope.md, section 2).
 
 Polarisation, analyser, mask, aberrations and the phase of the reference are evaluated on a
 quadrature of polar angles θ and azimuths φ; the field is computed from a Fourier series along φ.
@@ -34,18 +46,6 @@ determine it between the pixels too.  The lattice is that of any other pupil
 (`iscat_analysis._kernels.lattice`), with a real field: the imaginary part does not show in the
 interference and is not known.  For the scattered light itself, |e|², its lower limit (Re e)² is
 used.
-
-The scattered field around one particle, per unit amplitude and over the reference.
-
-Two tables have the same interface.  If only the polarisation gives the pupil a direction, it has a
-`RadialField`: quintics along r.  Any other pupil has a `LatticeField`.  Both give the kernels a
-profile at a height, a table of profiles along z, and the field at any point.
-
-Derivatives with respect to the microscope are analytic.  Every parameter of the optics changes the
-light of each ray in the pupil.  The derivative of the field is the integral of this change: a
-factor inside the pupil, and the light on an edge that moves (aperture, mask).  Each derivative is
-tabulated on the lattice of the field, once for each height, and combined with the field at the
-pixels.
 """
 
 from __future__ import annotations

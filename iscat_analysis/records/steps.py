@@ -1,7 +1,4 @@
-"""Records between steps: movies and sums of their frames, candidates, fits, verdicts.
-
-Data of a report.
-"""
+"""Records between steps: movies and sums of their frames, candidates, fits, verdicts, results."""
 
 from __future__ import annotations
 
