@@ -122,11 +122,8 @@ def evidence_beside(
 def _line(
     context: AnalysisContext, event: Event, quantum: Mapping[float, ComplexArray]
 ) -> dict[str, Any]:
-    line: dict[str, Any] = {
-        "frame": event.frame,
-        "n_before": event.n_before,
-        "n_after": event.n_after,
-    }
+    line: dict[str, Any] = {"frame": event.frame}
+    line |= {"n_before": event.n_before, "n_after": event.n_after}
     line |= line_of(
         event.likelihood, event.fit, collected_photons(context, event), event.flags,
         sign=event.sign,
@@ -137,9 +134,8 @@ def _line(
     if event.half_width is not None:
         line[FRAME_COLUMN] = event.half_width
     if context.config.fit.pairs:
-        pair = pair_of(
-            event.likelihood, event.fit, Evidence(*evidence_of(event.likelihood, event.fit))
-        )
+        beside = Evidence(*evidence_of(event.likelihood, event.fit))
+        pair = pair_of(event.likelihood, event.fit, beside)
         line |= pair._asdict() | {"pair_mass_kda": event.sign * pair.pair_mass_kda}
     return line
 

@@ -187,10 +187,8 @@ class SphereFrames:
                 break
             rows, owners = rows[kept], owners[kept]
             found = joint.maximised(rows, owners, common, least)
-            common, rows = (
-                found.theta[: common.size],
-                found.theta[common.size :].reshape(rows.shape),
-            )
+            rows = found.theta[common.size :].reshape(rows.shape)
+            common = found.theta[: common.size]
             converged = found.converged
             if not converged:
                 here = joint.gathered(rows, owners, common)

@@ -127,9 +127,8 @@ def refitted(
     likelihood: Likelihood, sphere: SeatedModel, fit: FitResult, *, level: bool
 ) -> tuple[Likelihood, FitResult]:
     """Fit a sphere that was recognised to counts of which its neighbours have changed."""
-    seated, again = fit_seated(
-        replace(likelihood, model=sphere, prior=None), fit.theta, level=level
-    )
+    own = replace(likelihood, model=sphere, prior=None)
+    seated, again = fit_seated(own, fit.theta, level=level)
     kept = [flag for flag in fit.flags if flag == Status.AMBIGUOUS_SIZE]
     status, noticed = verdict([*again.flags, *kept])
     return seated, replace(again, alternatives=fit.alternatives, status=status, flags=noticed)

@@ -131,13 +131,12 @@ def size_probability(
     weight = likelihood · volume · dd/dm.
     """
     best = float(optima[0].theta[3])
+    apart = max(OTHER_SIZE * sigma_kda, OTHER_SIZE_SHARE * best)
     weights, own = [], []
     for one in optima:
         if one.converged:
             weights.append(_log_weight(likelihood, one, box))
-            own.append(
-                abs(one.theta[3] - best) <= max(OTHER_SIZE * sigma_kda, OTHER_SIZE_SHARE * best)
-            )
+            own.append(abs(one.theta[3] - best) <= apart)
     if not np.isfinite(weights).any():
         return math.nan
     shares = np.exp(np.array(weights) - max(weights))

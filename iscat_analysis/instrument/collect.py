@@ -214,10 +214,8 @@ def bright_places(
         ]
         for apart_nm, side in ((alone_nm, _roi_px(config)), (0.0, round(OTHERS_NM / pixel)))
     )
-    images, others = (
-        [_among(image, others, SAME_NM) for image in some] for some in (images, others)
-    )
-    return _bright(images), others
+    seen = _bright(_among(image, others, SAME_NM) for image in images)
+    return seen, [_among(other, others, SAME_NM) for other in others]
 
 
 def known_places(
@@ -346,9 +344,8 @@ def _centred(likelihood: Likelihood, config: Config) -> ParticleImage:
     grid, height = likelihood.grid, config.particle.nominal_height_nm
     image = ParticleImage(grid, likelihood.noise, likelihood.data, 0.0, 0.0, height)
     y, x, snr = centre_of_energy(*contrast_of(image), grid.pixel_nm)
-    x_nm, y_nm = (
-        float(axis[0] + at * grid.pixel_nm) for axis, at in ((grid.x_nm, x), (grid.y_nm, y))
-    )
+    x_nm = float(grid.x_nm[0] + x * grid.pixel_nm)
+    y_nm = float(grid.y_nm[0] + y * grid.pixel_nm)
     return replace(image, x_nm=x_nm, y_nm=y_nm, snr=snr)
 
 

@@ -387,9 +387,8 @@ def learn_optics(
                 found = learned_from(tested.seen, recording, tuple(FREE), origin)
         except DataError as error:
             changing = tested is not None and tested.change.matters
-            return as_configured(
-                f"{error}; {tested.change.said}" if tested and changing else str(error)
-            )
+            why = f"{error}; {tested.change.said}" if tested and changing else str(error)
+            return as_configured(why)
     verdict = tested.change.said if passed else _verdict(tested)
     return adopted(found, config, tested.summary, verdict)
 

@@ -596,10 +596,8 @@ class OpticsSearch:
         if not {"focus_nm", "reference_phase_deg"} <= set(best.names):
             return best, None
         z = best.images[0].z_nm
-        mirrored = {
-            **best.values,
-            **{n: PARAMETERS[n].mirrored * best.values[n] for n in best.names},
-        }
+        mirrored = dict(best.values)
+        mirrored |= {n: PARAMETERS[n].mirrored * best.values[n] for n in best.names}
         mirrored["focus_nm"] = 2 * z - best.values["focus_nm"]
         turned = [replace(s, mass_kda=-s.mass_kda) for s in best.images]
         # after which a twin is far nearer than _CLOSE

@@ -113,9 +113,8 @@ class ParticleImage:
     @property
     def offset_nm(self) -> tuple[float, float]:
         """Place y, x of its particle from the centre of the picture."""
-        return self.y_nm - float(np.mean(self.grid.y_nm)), self.x_nm - float(
-            np.mean(self.grid.x_nm)
-        )
+        middle_y, middle_x = float(np.mean(self.grid.y_nm)), float(np.mean(self.grid.x_nm))
+        return self.y_nm - middle_y, self.x_nm - middle_x
 
     def moved(self, private: FloatArray) -> ParticleImage:
         """Return the same pictures with another start."""
@@ -206,10 +205,8 @@ def best_amplitudes(
     b, q, g, h, k = (v[..., None] for v in (linear, square, ll, ls, ss))
     explained = 2 * (b * tried + q * tried**2) - (g * tried**2 + 2 * h * tried**3 + k * tried**4)
     best = np.argmax(explained, axis=-1)[..., None]
-    return (
-        np.take_along_axis(tried, best, -1)[..., 0],
-        np.take_along_axis(explained, best, -1)[..., 0],
-    )
+    amplitude, gain = (np.take_along_axis(v, best, -1)[..., 0] for v in (tried, explained))
+    return amplitude, gain
 
 
 def average_particle_images(images: Images) -> tuple[Images, Images]:

@@ -187,9 +187,8 @@ def _beside(measured: Events, power: float, population: Mixture) -> Events:
     spread = (weight * (x - mean) ** 2).sum(axis=0)
     # of the information of an error, at least
     information = np.maximum(1 / spread - 1 / variance, 0.05 / measured.variance)
-    return Events(
-        (mean / spread - centre / variance) / information, information**-0.5, None, plain=True
-    )
+    mean = (mean / spread - centre / variance) / information
+    return Events(mean, information**-0.5, None, plain=True)
 
 
 def _curve(events: Events, best: Mixture) -> pd.DataFrame:

@@ -373,10 +373,8 @@ def likelihood_at(track: Displacements, lags: Lags, at: FloatArray) -> _There:
         math.exp(at[0]) * mean_squared_displacement(track, lags.distinct, power)
         for power in at[1] + _EXPONENT_STEP * np.arange(-1, 2)
     )
-    motion, turn = (
-        covariance(lags, there),
-        covariance(lags, (after - before) / (2 * _EXPONENT_STEP)),
-    )
+    motion = covariance(lags, there)
+    turn = covariance(lags, (after - before) / (2 * _EXPONENT_STEP))
     bend = covariance(lags, (after - 2 * there + before) / _EXPONENT_STEP**2)
     value, slope = -0.5 * track.steps_nm.size * math.log(2 * math.pi), np.zeros(2)
     curvature, information = np.zeros((2, 2)), np.zeros((2, 2))

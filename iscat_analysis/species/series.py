@@ -29,7 +29,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -182,11 +181,8 @@ class Series:
     def _middles(self) -> FloatArray:
         """Give the ends of the window, and the middles of gaps between peaks that are apart."""
         order = np.sort(self.masses)
-        gaps = [
-            (below + above) / 2
-            for below, above in pairwise(order)
-            if above - below > 3 * self.width
-        ]
+        apart = np.diff(order) > 3 * self.width
+        gaps = ((order[:-1] + order[1:]) / 2)[apart]
         return np.array([self.ends[0], *gaps, self.ends[1]])
 
     def _background(self) -> tuple[FloatArray, FloatArray, FloatArray]:
