@@ -206,8 +206,8 @@ def pair_of(likelihood: Likelihood, fit: FitResult, evidence: Evidence) -> Pair:
     mass = halves.parameters[MASS]
     point = both.score_fisher(np.insert(fit.theta, LEVEL, [0.0, 0.0]))[0]
     rows, _ = halves.rows(likelihood.grid, theta)
-    own = (np.delete(each, [4, 5]) for each in (theta, free))
-    chi2, p_value = goodness_of_fit(likelihood, *own, rows)
+    own, varied = np.delete(theta, [4, 5]), np.delete(free, [4, 5])
+    chi2, p_value = goodness_of_fit(likelihood, own, varied, rows)
     return Pair(
         pair_mass_kda=float(mass.reported(theta[MASS])),
         separation_nm=2 * apart,
