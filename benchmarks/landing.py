@@ -152,7 +152,7 @@ def sliding_ratio(frames: int, side: int, peer: Path | None) -> dict[str, float 
 
             def one(k: int) -> None:
                 before, after = chunk.blocks_e[max(k - 4, 0) : k], chunk.blocks_e[k : k + 4]
-                contrast_map(before, after, weight, np.empty((side, side), dtype=np.float32))
+                contrast_map(before, after, weight)
 
             list(pool.map(one, range(1, len(chunk.blocks_e))))
 

@@ -146,32 +146,25 @@ def find_clusters(squares: IntArray, starts: IntArray, owner: IntArray) -> None:
                         owner[q] = low
 
 
-@kernel(_nrt=False)
+@kernel()
 def join_rows(
     slopes: Slopes, clusters: Clusters, light: Light, totals: NDArray[np.float32],
-    information: FloatArray, first: int, last: int, numbers: FloatArray, order: IntArray,
-    work: NDArray[np.float32],
+    information: FloatArray, first: int, last: int,
 ) -> None:  # fmt: skip
     """Factorise the information on the rows of some clusters, and let them respond to each other.
 
     Each row was fitted with the others at their positions then.  Rows that were fitted after it
     have changed by Δ since, so that its score is now -Σ F Δ; all rows of the cluster respond to it.
 
-    Shapes: `totals` (t, y, x), `information` (rows, k, k), `numbers` (2 n² + 2 n + k²,), `order`
-    (n,), `work` (1 + 2 k, side²).
+    Shapes: `totals` (t, y, x), `information` (rows, k, k).
     """
-    k, most = slopes.values.shape[1], order.size
-    scale, step = numbers[:most], numbers[most : 2 * most]
-    block = numbers[2 * most : 2 * most + k * k].reshape(k, k)
-    squares = numbers[2 * most + k * k :]
+    _, k, area = slopes.values.shape
+    block, work = np.empty((k, k)), np.empty((1 + 2 * k, area), np.float32)
     for c in range(first, last):
         rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
         n, t = k * rows.size, clusters.frame[c]
-        joint, other = squares[: n * n].reshape(n, n), squares[n * n : 2 * n * n].reshape(n, n)
-        for i in range(n):
-            order[i], step[i] = i, 0.0
-            for j in range(n):
-                joint[i, j] = 0.0
+        joint, other = np.zeros((n, n)), np.empty((n, n))
+        order, scale, step = np.arange(n), np.empty(n), np.zeros(n)
         for a in range(rows.size):
             for i in range(k):
                 for j in range(k):
@@ -191,14 +184,12 @@ def join_rows(
         for turn in range(2 if damped_steps else 1):
             out = low if turn == 0 else other
             damping = max(damping, _LEAST_DAMPING_LINKED if turn else _LEAST_DAMPING)
-            while (
-                not factorise(joint, order[:n], scale, damping, out) and damping < _LARGEST_DAMPING
-            ):
+            while not factorise(joint, order, scale, damping, out) and damping < _LARGEST_DAMPING:
                 damping *= 10.0
         if damped_steps:
             for i in range(n):
                 step[i] *= scale[i]
-            solve(other, step[:n])
+            solve(other, step)
             for a in range(rows.size):
                 for i in range(k):
                     clusters.steps[rows[a], i] = step[k * a + i] * scale[k * a + i]
@@ -255,26 +246,28 @@ def _copy_part(
             line[j] = unit * np.float32(there[j])
 
 
-@kernel(fastmath=FAST, _nrt=False)
+@kernel(fastmath=FAST)
 def follow_rows(
     slopes: Slopes, clusters: Clusters, first: int, last: int, move: FloatArray,
-    steps: FloatArray, out: FloatArray, seen: NDArray[np.float32], step: FloatArray,
+    steps: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
     """Give the response of the rows of some clusters to a change of ln(background).
 
-    Shapes: `move` (y, x), `steps` (rows, k), `out` (y, x), `seen` (side²,).
+    Shapes: `move` (y, x), `steps` (rows, k), `out` (y, x).
     """
-    k = slopes.values.shape[1]
+    _, k, area = slopes.values.shape
+    seen = np.empty(area, np.float32)
     for c in range(first, last):
         rows = clusters.rows[clusters.edges[c] : clusters.edges[c + 1]]
         n = k * rows.size
+        step = np.empty(n)
         for q in range(rows.size):
             r = rows[q]
             size = gather(move, slopes.squares[r], seen)
             for a in range(k):
                 step[k * q + a] = slopes.units[r, a] * product(slopes.values[r, a], seen, size)
         low = clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n)
-        solve(low, step[:n])
+        solve(low, step)
         for q in range(rows.size):
             r = rows[q]
             here, square = steps[r], slopes.squares[r]
@@ -285,17 +278,14 @@ def follow_rows(
                 put(seen, square, out)
 
 
-@kernel(fastmath=FAST, _nrt=False)
-def own_shares(
-    slopes: Slopes, rows: IntArray, squares: IntArray, weight: FloatArray, out: FloatArray,
-    work: FloatArray, weighted: FloatArray,
-) -> None:  # fmt: skip
+@kernel(fastmath=FAST)
+def own_shares(slopes: Slopes, rows: IntArray, squares: IntArray, weight: FloatArray) -> FloatArray:
     """Give Gᵀ diag(weight) G of each row: the information that the background takes from it.
 
-    Shapes: `rows` (n,), `squares` (n, 4), `weight` (y, x), `out` (n, k, k), `work, weighted`
-    (side²,).
+    Shapes: `rows` (n,), `squares` (n, 4), `weight` (y, x), result (n, k, k).
     """
-    k = slopes.values.shape[1]
+    _, k, area = slopes.values.shape
+    out, work, weighted = np.empty((rows.size, k, k)), np.empty(area), np.empty(area)
     for q in range(rows.size):
         values, units = slopes.values[rows[q]], slopes.units[rows[q]]
         size = gather(weight, squares[q], work)
@@ -305,17 +295,18 @@ def own_shares(
                 weighted[j] = unit * work[j] * slope[j]
             for b in range(a + 1):
                 out[q, a, b] = out[q, b, a] = units[b] * product(values[b], weighted, size)
+    return out
 
 
-@kernel(fastmath=FAST, _nrt=False)
+@kernel(fastmath=FAST)
 def send(
-    slopes: Slopes, rows: IntArray, squares: IntArray, by: FloatArray, out: FloatArray,
-    work: FloatArray,
-) -> None:  # fmt: skip
+    slopes: Slopes, rows: IntArray, squares: IntArray, by: FloatArray, out: FloatArray
+) -> None:
     """Add G times numbers of the rows to images.
 
-    Shapes: `by` (n, b, k), `out` (b, y, x), `work` (side²,).
+    Shapes: `by` (n, b, k), `out` (b, y, x).
     """
+    work = np.empty(slopes.values.shape[2])
     for q in range(rows.size):
         values, units, square = slopes.values[rows[q]], slopes.units[rows[q]], squares[q]
         size = (square[1] - square[0]) * (square[3] - square[2])
@@ -324,17 +315,17 @@ def send(
             put(work, square, out[v])
 
 
-@kernel(fastmath=FAST, _nrt=False)
+@kernel(fastmath=FAST)
 def follow(
-    slopes: Slopes, rows: IntArray, squares: IntArray, covariance: FloatArray,
-    images: FloatArray, projections: FloatArray, out: FloatArray, work: FloatArray, by: FloatArray,
-) -> None:  # fmt: skip
-    """Give Gᵀ times images for each row, and add G F⁻¹ Gᵀ times these images to `out`.
+    slopes: Slopes, rows: IntArray, squares: IntArray, covariance: FloatArray, images: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Give Gᵀ times images for each row, and the sum of G F⁻¹ Gᵀ times these images.
 
-    Shapes: `covariance` (n, k, k), `images` (b, y, x), `projections` (n, b, k), `out` (b, y, x),
-    `work` (side²,), `by` (k,).
+    Shapes: `covariance` (n, k, k), `images` (b, y, x), results (n, b, k), (b, y, x).
     """
-    k = slopes.values.shape[1]
+    _, k, area = slopes.values.shape
+    projections, out = np.empty((rows.size, images.shape[0], k)), np.zeros(images.shape)
+    work, by = np.empty(area), np.empty(k)
     for q in range(rows.size):
         values, units, square = slopes.values[rows[q]], slopes.units[rows[q]], squares[q]
         for v in range(images.shape[0]):
@@ -347,3 +338,4 @@ def follow(
                     by[a] += covariance[q, a, b] * projections[q, v, b]
             mix(values, units, by, size, work)
             put(work, square, out[v])
+    return projections, out

@@ -21,7 +21,7 @@ import numpy as np
 from iscat_analysis._kernels import FAST, BoolArray, FloatArray, kernel
 from iscat_analysis._kernels.lattice import BENT, lattice_waves
 from iscat_analysis._kernels.lens import LATTICE, LatticeLens, Lens, Pixels, RoundLens
-from iscat_analysis._kernels.loops import factorise, marked
+from iscat_analysis._kernels.loops import factorise, marked, solve
 from iscat_analysis._kernels.noise import FLOOR, Measured, bias_of_pixel, curvature_of_row
 from iscat_analysis._kernels.radial import AxialTable, profile_at
 from iscat_analysis._kernels.radial_rows import DISTANCE, evaluate_bends, evaluate_last_slopes
@@ -274,7 +274,7 @@ def invert(matrix: FloatArray, like: FloatArray, active: BoolArray, out: FloatAr
     """
     index = marked(active)
     n = index.size
-    lower, inverse, scale = np.zeros((n, n)), np.zeros((n, n)), np.empty(5)
+    lower, column, scale = np.zeros((n, n)), np.empty(n), np.empty(5)
     for i in range(5):
         scale[i] = 1.0 / np.sqrt(max(like[i, i], FLOOR))
     out[:] = 0.0
@@ -282,18 +282,11 @@ def invert(matrix: FloatArray, like: FloatArray, active: BoolArray, out: FloatAr
         out[:] = np.nan
         return False
     for j in range(n):
-        inverse[j, j] = 1.0 / lower[j, j]
-        for i in range(j + 1, n):
-            total = 0.0
-            for k in range(j, i):
-                total -= lower[i, k] * inverse[k, j]
-            inverse[i, j] = total / lower[i, i]
-    for i in range(n):
-        for j in range(n):
-            total = 0.0
-            for k in range(max(i, j), n):
-                total += inverse[k, i] * inverse[k, j]
-            out[index[i], index[j]] = total * scale[index[i]] * scale[index[j]]
+        for i in range(n):
+            column[i] = scale[index[i]] if i == j else 0.0
+        solve(lower, column)
+        for i in range(n):
+            out[index[i], index[j]] = column[i] * scale[index[i]]
     return True
 
 

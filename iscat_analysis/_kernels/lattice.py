@@ -355,12 +355,14 @@ def _node(lens: LatticeLens, away: float) -> float:
 
 
 @kernel()
-def node_rows(lens: LatticeLens, pixels: Pixels, y_p: float) -> tuple[int, int]:
-    """First row of nodes that an image needs, and how many."""
+def nodes_needed(
+    lens: LatticeLens, pixels: Pixels, axis: FloatArray, place: float
+) -> tuple[int, int]:
+    """First node along an axis of pixels that an image needs, and how many."""
     margin = abs(pixels.offsets[-1])
-    low, high = _ends(pixels.y)
-    first = int(_node(lens, low - margin - y_p)) - BEFORE
-    last = int(_node(lens, high + margin - y_p)) - BEFORE
+    low, high = _ends(axis)
+    first = int(_node(lens, low - margin - place)) - BEFORE
+    last = int(_node(lens, high + margin - place)) - BEFORE
     return first, last + TAPS - first
 
 
@@ -421,7 +423,7 @@ def interpolate_columns(
     Shapes: result (rows, nx): after `FIELDS` rows, for each sample along x, each channel at each
     row of nodes.
     """
-    first, rows = node_rows(lens, pixels, theta[1])
+    first, rows = nodes_needed(lens, pixels, pixels.y, theta[1])
     columns, samples, here = pixels.x.size, pixels.offsets.size, FIELDS
     f = np.empty((FIELDS + samples * (values + slopes) * rows, columns))
     w, left = np.empty((2, columns, TAPS)), np.empty(columns, dtype=np.int64)
@@ -472,7 +474,7 @@ def lattice_row(
     lens: LatticeLens, pixels: Pixels, row: int, theta: FloatArray, f: FloatArray, out: FloatArray
 ) -> None:
     """Fill `out` with signal and gradient (5, nx) of one row, or its signal alone (1, nx)."""
-    first, rows = node_rows(lens, pixels, theta[1])
+    first, rows = nodes_needed(lens, pixels, pixels.y, theta[1])
     gradient, w = len(out) > 1, np.empty((2, TAPS))
     width, q = 2 * lens.components, pixels.offsets.size
     apart = width * rows
@@ -517,7 +519,7 @@ def lattice_values(
 
     Shapes: `stack` (k·components·2, nodes, nodes), `out` (k, ny, nx).
     """
-    first, rows = node_rows(lens, pixels, theta[1])
+    first, rows = nodes_needed(lens, pixels, pixels.y, theta[1])
     columns, channels, a = pixels.x.size, stack.shape[0], theta[3]
     across = interpolate_columns(stack, lens, pixels, theta, channels, 0)
     w, f = np.empty((1, TAPS)), np.empty((channels, columns))
@@ -539,16 +541,6 @@ def lattice_values(
                     for k in range(1, out.shape[0]):
                         change = 2 * (k * components + c)
                         _add_product(rho, 2 * a * weight, f, 2 * c, change, out[k, row])
-
-
-@kernel()
-def lattice_span(lens: LatticeLens, x: FloatArray, margin: float, x_p: float) -> tuple[int, int]:
-    """Range of the flattened lattice that an image needs."""
-    side = 2 * lens.half + 1
-    low, high = _ends(x)
-    first = int(_node(lens, low - margin - x_p)) - BEFORE
-    last = int(_node(lens, high + margin - x_p)) - BEFORE + TAPS
-    return first * side, last * side
 
 
 @kernel()

@@ -21,12 +21,13 @@ interval; the channels are Re F0, Im F0, Re F2, Im F2, followed by the same four
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import j0, j1
+from scipy.special import hyp0f1
 
 from iscat_analysis._kernels import FloatArray, kernel
 from iscat_analysis._kernels.loops import whole
@@ -52,36 +53,6 @@ class AxialTable(NamedTuple):
     kappa: float
 
 
-def reduced_bessel(x: FloatArray) -> FloatArray:
-    """J_ν(x)/x^ν for ν = 0…4.
-
-    Upward recurrence from scipy's J0 and J1 where it is stable, the power series below.
-
-    Shapes: result (5, *x.shape).
-    """
-    out = np.empty((5, *x.shape))
-    small = x < 5.0
-    q = -((x[small] / 2) ** 2)
-    for order in range(5):
-        term = np.full(q.shape, 1.0)
-        for m in range(1, order + 1):
-            term /= 2 * m
-        total = term.copy()
-        for m in range(1, 26):
-            term *= q / (m * (m + order))
-            total += term
-        out[order][small] = total
-    large = x[~small]
-    lower, upper = j0(large), j1(large)
-    out[0][~small], out[1][~small] = lower, upper / large
-    power = large.copy()
-    for order in range(2, 5):
-        lower, upper = upper, 2 * (order - 1) / large * upper - lower
-        power *= large
-        out[order][~small] = upper / power
-    return out
-
-
 def bessel_table(transverse: FloatArray, step_nm: float, intervals: int) -> FloatArray:
     """Bessel matrices of the radial grid.
 
@@ -90,7 +61,8 @@ def bessel_table(transverse: FloatArray, step_nm: float, intervals: int) -> Floa
     a = transverse[:, None]
     h = step_nm
     x = a * (h * np.arange(intervals + 1))
-    f = reduced_bessel(x)
+    # J_ν(x)/x^ν
+    f = [hyp0f1(nu + 1, -((x / 2) ** 2)) / (2**nu * math.factorial(nu)) for nu in range(5)]
     ah = a * h
     table = np.empty((2, transverse.size, 3, intervals + 1))
     table[0, :, 0] = f[0]

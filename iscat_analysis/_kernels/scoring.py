@@ -19,7 +19,7 @@ import numpy as np
 
 from iscat_analysis._kernels import FAST, BoolArray, FloatArray, kernel
 from iscat_analysis._kernels.image import begin_strips, fill_strip, signal_image, signal_parts
-from iscat_analysis._kernels.lattice import lattice_span
+from iscat_analysis._kernels.lattice import nodes_needed
 from iscat_analysis._kernels.lens import LATTICE, STAMP, Lens, Pixels, named_lens
 from iscat_analysis._kernels.loops import copy_line, factorise, marked, solve
 from iscat_analysis._kernels.noise import Measured, score_of_pixel, value_of_pixels
@@ -166,8 +166,9 @@ def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int
     if len(lens) == STAMP:
         return zero, width
     if len(lens) == LATTICE:
-        first, last = lattice_span(lens, pixels.x, abs(pixels.offsets[-1]), theta[0])
-        return first, last
+        first, count = nodes_needed(lens, pixels, pixels.x, theta[0])
+        side = 2 * lens.half + 1
+        return first * side, (first + count) * side
     return zero, POWERS * intervals_needed(lens, pixels, theta, width // POWERS)
 
 

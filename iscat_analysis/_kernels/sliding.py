@@ -74,42 +74,16 @@ def frame_totals(counts: NDArray[Any], zero: Any, out: NDArray[Any], same: BoolA
                     break
 
 
-@kernel(fastmath={"reassoc", "nsz"})
-def _add_rows(images: MapArray, i: int, out: MapArray) -> None:
-    """Add row i of every image.
-
-    Shapes: `images` (k, y, x), `out` (x,).
-    """
-    for k in range(images.shape[0]):
-        for j in range(out.size):
-            out[j] += images[k, i, j]
-
-
-@kernel(fastmath={"reassoc", "nsz"})
-def contrast_map(earlier: MapArray, later: MapArray, weight: MapArray, out: MapArray) -> float:
+def contrast_map(earlier: MapArray, later: MapArray, weight: MapArray) -> MapArray:
     """Weighted contrast of two sums over the field, minus its weighted mean.
 
-    Shapes: `earlier, later` (k, y, x), `weight` (y, x), `out` (y, x).
+    Shapes: `earlier, later` (k, y, x), `weight` (y, x), result (y, x).
     """
-    rows, columns = weight.shape
-    before = np.zeros((rows, columns), dtype=np.float32)
-    after = np.zeros((rows, columns), dtype=np.float32)
-    total_before = 0.0
-    total_after = 0.0
-    for i in range(rows):
-        _add_rows(earlier, i, before[i])
-        _add_rows(later, i, after[i])
-        for j in range(columns):
-            total_before += before[i, j] if weight[i, j] > 0 else 0.0
-            total_after += after[i, j] if weight[i, j] > 0 else 0.0
-    ratio = total_after / total_before
-    for i in range(rows):
-        for j in range(columns):
-            if weight[i, j] > 0:
-                out[i, j] = weight[i, j] * (after[i, j] / (ratio * before[i, j]) - 1.0)
-            else:
-                out[i, j] = 0.0
-    return ratio
+    before, after, used = earlier.sum(axis=0), later.sum(axis=0), weight > 0
+    ratio = after[used].sum(dtype=np.float64) / before[used].sum(dtype=np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        stretch = np.divide(after, ratio * before, out=np.ones(weight.shape), where=used)
+    return np.asarray(weight * (stretch - 1.0), dtype=np.float32)
 
 
 _LEAST_KNOWN = 1e-9  # of a sum of squares that is left beside a mean, and is not rounding
@@ -150,26 +124,6 @@ def best_line(
             if gain > least:
                 least, found = gain, centre
     return least, found
-
-
-@kernel(fastmath=True)
-def frame_scores(
-    counts: NDArray[Any], lit: BoolArray, weights: FloatArray, out: FloatArray
-) -> None:
-    """Sum frames with several sets of weights at once.
-
-    Shapes: `counts` (t, p), `lit` (t,), `weights` (n, p), `out` (n, m).
-    """
-    m = 0
-    for t in range(counts.shape[0]):
-        if not lit[t]:
-            continue
-        for n in range(weights.shape[0]):
-            total = 0.0
-            for i in range(weights.shape[1]):
-                total += weights[n, i] * counts[t, i]
-            out[n, m] = total
-        m += 1
 
 
 @kernel()

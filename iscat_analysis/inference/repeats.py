@@ -34,7 +34,6 @@ from numpy.typing import NDArray
 from scipy.fft import dct
 from scipy.special import ndtri, stdtr, stdtrit
 
-from iscat_analysis._kernels.sliding import frame_scores
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.maximiser import covariance_of
 from iscat_analysis.records import BoolArray, FloatArray, IntArray
@@ -120,8 +119,7 @@ def series_of(
     """
     lit, number = power > 0, len(weights)
     seen = weights * gain
-    values = np.empty((number, np.count_nonzero(lit)))
-    frame_scores(counts.reshape(len(counts), -1), lit, seen.reshape(number, -1), values)
+    values = seen.reshape(number, -1) @ counts[lit].reshape(-1, seen[0].size).T
     values -= np.sum(seen * offset, axis=(1, 2))[:, None]
     squared = weights.reshape(number, -1) ** 2
     shot, read = (squared @ e.ravel() for e in (np.maximum(mean_e, 0.0), read_variance_e2))

@@ -304,10 +304,8 @@ class LandingSearch:
         at = blocks_before - 1  # the boundary between blocks at which `frame` begins
         known = pattern.contrast[at] if pattern else None
         earlier, later = slice(max(at + 1 - STRIDES, 0), at + 1), slice(at + 1, at + 1 + STRIDES)
-        image = np.zeros(chunk.shape, dtype=np.float32)
-        contrast_map(
-            chunk.blocks_e[earlier], chunk.blocks_e[later], chunk.usable.astype(np.float32), image
-        )
+        usable = chunk.usable.astype(np.float32)
+        image = contrast_map(chunk.blocks_e[earlier], chunk.blocks_e[later], usable)
         contrast = np.where(chunk.usable, image.astype(np.float64), np.nan)
         if known is not None:
             contrast = (1 + contrast) / (1 + known) - 1

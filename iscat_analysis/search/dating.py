@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import erfc, logsumexp
 
-from iscat_analysis._kernels.sliding import best_line, frame_scores
+from iscat_analysis._kernels.sliding import best_line
 from iscat_analysis.records import FloatArray, IntArray
 from iscat_analysis.search.frames import Patch
 
@@ -275,13 +275,11 @@ def frame_heights(patch: Patch, image: FloatArray) -> tuple[FloatArray, FloatArr
     Shapes: `image` (ny, nx), `heights` (t,), `weight` (t,).
     """
     weights, scale = _projector(patch, image)
-    scores = np.empty((1, len(patch.counts)))
-    every = np.ones(scores.size, dtype=np.bool_)
-    frame_scores(patch.pixels, every, (weights * patch.gain).reshape(1, -1), scores)
+    scores = patch.pixels @ (weights * patch.gain).ravel()
     power = patch.power
     lit = power > 0
     zero = float(np.sum(weights * patch.gain * patch.offset))
-    heights = (scores[0] - zero) / np.where(lit, power, 1.0) / scale
+    heights = (scores - zero) / np.where(lit, power, 1.0) / scale
     return heights, np.where(lit, power, 0.0) * scale, scale
 
 

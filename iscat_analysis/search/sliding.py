@@ -154,7 +154,8 @@ def sliding_maps(
             return np.zeros((rows, columns), dtype=np.float32)
         blocks = chunk.blocks_e
         image = np.zeros(matched.size, dtype=np.float32)
-        contrast_map(blocks[low:middle], blocks[middle:high], matched.weight, image)
+        contrast = contrast_map(blocks[low:middle], blocks[middle:high], matched.weight)
+        image[:rows, :columns] = contrast
         if explained is not None:
             first, turn, last = chunk.edges[[low, middle, high]].tolist()
             known = explained(j, slice(first, turn), slice(turn, last))

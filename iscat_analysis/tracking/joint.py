@@ -193,7 +193,6 @@ class Coupling:
         share = np.where(field.used[cut], level / (level + field.read_e2[cut]), 0.0)
         self._weight = share / np.maximum(field.total_e[cut], 1.0)
         self._sigma = np.sqrt(self._weight)
-        self._room = slopes.values.shape[2]
 
     @property
     def pixels(self) -> int:
@@ -205,12 +204,8 @@ class Coupling:
 
         Shapes: result (n, free, free).
         """
-        free = self._slopes.values.shape[1]
-        out = np.zeros((len(self._rows), free, free))
-        own_shares(
-            self._slopes, self._rows, self._squares, self._weight, out, *np.empty((2, self._room))
-        )
-        return out
+        shares: FloatArray = own_shares(self._slopes, self._rows, self._squares, self._weight)
+        return shares
 
     def sent(self, by: FloatArray) -> FloatArray:
         """Change of the background that changes of rows make, N⁻½ Σ Gᵀ by.
@@ -218,7 +213,7 @@ class Coupling:
         Shapes: `by` (n, b, free), result (b, pixels).
         """
         out = np.zeros((by.shape[1], *self._weight.shape))
-        send(self._slopes, self._rows, self._squares, by, out, np.empty(self._room))
+        send(self._slopes, self._rows, self._squares, by, out)
         return (out * self._sigma).reshape(len(out), -1)
 
     def followed(self, covariance: FloatArray, images: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -228,10 +223,7 @@ class Coupling:
         pixels).
         """
         seen = np.multiply(images.reshape(-1, *self._weight.shape), self._sigma, order="C")
-        felt = np.zeros((len(self._rows), len(images), covariance.shape[1]))
-        out = np.zeros_like(seen)
-        room = np.empty(self._room), np.empty(covariance.shape[1])
-        follow(self._slopes, self._rows, self._squares, covariance, seen, felt, out, *room)
+        felt, out = follow(self._slopes, self._rows, self._squares, covariance, seen)
         return felt, (out * self._sigma).reshape(images.shape)
 
 

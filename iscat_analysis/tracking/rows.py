@@ -158,28 +158,13 @@ class Response:
         frame = np.searchsorted(starts, firsts, side="right") - 1
         factors, steps = np.empty(corners[-1]), np.zeros(slopes.moves.shape)
         self._clusters = Clusters(rows, edges, frame, corners, factors, steps)
-        k, area = slopes.values.shape[1:]
-        self._largest = n = k * int(count.max(initial=0))
-
-        def join(a: int, b: int) -> None:
-            place, lines = np.empty(n, np.int64), np.empty((1 + 2 * k, area), np.float32)
-            room = np.empty(2 * n * n + 2 * n + k * k), place, lines
-            join_rows(slopes, self._clusters, light, totals, information, a, b, *room)
-
-        self._share(join)
+        known = slopes, self._clusters, light, totals, information
+        self._share(lambda a, b: join_rows(*known, a, b))
 
     def _share(self, task: Callable[[int, int], T]) -> list[T]:
         """Run a task for parts of the clusters, half-open ranges, several at a time."""
         edges = np.linspace(0, len(self._clusters.frame), 8 + 1).astype(int).tolist()
         return list(self._pool.map(lambda part: task(*part), pairwise(edges)))
-
-    def _follow(
-        self, first: int, last: int, image: FloatArray, steps: FloatArray, out: FloatArray
-    ) -> None:
-        """Let some clusters follow an image of the background's logarithm, and draw that."""
-        square = np.empty(self._slopes.values.shape[2], dtype=np.float32)
-        room = square, np.empty(self._largest)
-        follow_rows(self._slopes, self._clusters, first, last, image, steps, out, *room)
 
     def step(
         self, move: FloatArray, total: FloatArray, used: BoolArray, damping: float
@@ -199,7 +184,7 @@ class Response:
 
             def taken(first: int, last: int) -> FloatArray:
                 out = np.zeros(used.shape)
-                self._follow(first, last, image, room, out)
+                follow_rows(self._slopes, self._clusters, first, last, image, room, out)
                 return out
 
             out = (1 + damping) * counts * image
@@ -223,7 +208,8 @@ class Response:
         Shapes: `step` (y, x).
         """
         steps, nowhere = np.empty_like(self._slopes.units), np.empty((0, 0))
-        self._share(lambda a, b: self._follow(a, b, step, steps, nowhere))
+        known = self._slopes, self._clusters
+        self._share(lambda a, b: follow_rows(*known, a, b, step, steps, nowhere))
         theta, index = rows.theta.copy(), self._index
         theta[:, index] = np.clip(theta[:, index] - steps, *self._walls)
         return replace(rows, theta=theta)
