@@ -22,10 +22,7 @@ LOG_2PI = math.log(2.0 * math.pi)
 TOGETHER = 8
 """Number of variances whose product cannot overflow, so that one logarithm is enough for them."""
 
-_LOWEST_RATIO = 1e-5  # lowest value of D on the first grid over the highest
 _GRID_POINTS = 25
-_GRIDS = 2  # a second, finer one between the neighbours of the best point
-_NEWTON, _TOLERANCE = 20, 1e-12  # steps at most; the last one's length over the scale of D
 
 
 @kernel()
@@ -122,13 +119,16 @@ def most_likely_diffusion(moves: Moves, scale: float) -> float:
     grid = np.empty(_GRID_POINTS + 1)
     grid[0] = 0.0
     for k in range(_GRID_POINTS):
-        grid[k + 1] = top * _LOWEST_RATIO ** (1.0 - k / (_GRID_POINTS - 1.0))
-    for _ in range(_GRIDS):
+        # lowest value of D on the first grid over the highest
+        grid[k + 1] = top * 1e-5 ** (1.0 - k / (_GRID_POINTS - 1.0))
+    # a second grid is finer, between the neighbours of the best point
+    for _ in range(2):
         values = displacement_likelihoods(moves, grid)
         highest = largest(values)
         best = grid[highest]
         low, high = grid[max(highest - 1, 0)], grid[min(highest + 1, grid.size - 1)]
-        for _ in range(_NEWTON):
+        # steps at most, until the last one's length is small beside the scale of D
+        for _ in range(20):
             there = displacement_likelihood(moves, best)
             if not there[2] < 0.0:
                 break
@@ -136,7 +136,7 @@ def most_likely_diffusion(moves: Moves, scale: float) -> float:
             if not low <= best + step <= high:
                 break
             best += step
-            if abs(step) < _TOLERANCE * scale:
+            if abs(step) < 1e-12 * scale:
                 return float(best)
         grid = np.empty(_GRID_POINTS)
         for k in range(_GRID_POINTS):

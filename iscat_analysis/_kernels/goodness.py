@@ -26,8 +26,6 @@ from iscat_analysis._kernels.noise import (
     variance_of_pixel,
 )
 
-_DEPENDENT = 1e-8  # share of a mode outside the fitted directions that counts as none
-_NORMAL = 1e-4  # excess kurtosis that changes no p-value
 _TAILS = 8  # pixels whose exact tail probabilities are computed
 
 
@@ -157,7 +155,8 @@ def _score_statistic(
             # zero along directions that are left out
             matrix[k, j] = (matrix[k, j] - total) / matrix[j, j] if used[j] else 0.0
             left -= matrix[k, j] ** 2
-        if not (size > 0.0 and left > _DEPENDENT * size):
+        # share of a mode outside the fitted directions that counts as none
+        if not (size > 0.0 and left > 1e-8 * size):
             continue
         used[k] = True
         matrix[k, k] = np.sqrt(left)
@@ -212,7 +211,8 @@ def count_and_test(
     mode_chi2, freedom = _score_statistic(matrix, vector, index.size, used)
     # the leverages are at most 1 and their sum is `freedom`, which limits their effect
     mode_excess = largest
-    if largest > _NORMAL and freedom > 0:
+    # a smaller excess kurtosis changes no p-value
+    if largest > 1e-4 and freedom > 0:
         _orthonormal(flat, matrix, used)
         mode_excess = 0.0
         for i in range(y.size):

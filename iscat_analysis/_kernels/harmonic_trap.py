@@ -16,12 +16,10 @@ from iscat_analysis._kernels.loops import copy_line, largest
 Track = tuple[FloatArray, FloatArray, FloatArray, float]
 """Positions (c, n), the variances of their errors (c, n), times between them (n − 1,), exposure."""
 
-_SHORT = 1e-2  # stiffness times exposure below which the moments are computed from a series
 _STIFFNESSES = 10  # number of stiffnesses among which the search begins
-_FIRST, _FINER = 0.3, 0.3  # first distance of the compared points, and the factor of each step
+_FINER = 0.3  # factor of the distance of the compared points in each step
 _LARGEST_LOG_RATIO = 10.0  # largest logarithm of D over that of free diffusion
 _TOLERANCE = 1e-4  # tolerance of the log-likelihood at its maximum
-_MOST_ROUNDS = 100  # largest number of rounds of the search
 
 
 @kernel(fastmath=FAST)
@@ -50,7 +48,8 @@ def harmonic_likelihoods(track: Track, diffusion: FloatArray, stiffness: FloatAr
             decay[i], mean[i] = math.exp(-u), left / u
             var_end[i] = -width[i] * math.expm1(-2.0 * u)
             both[i] = width[i] * left * left / u
-            if u < _SHORT:
+            # with little stiffness times exposure the moments are computed from a series
+            if u < 1e-2:
                 series = 1.0 / 3.0 - u * (0.25 - u * (7.0 / 60.0 - u / 24.0))
                 var_mean[i] = 2.0 * diffusion[i] * exposure * series
             else:
@@ -113,8 +112,9 @@ def most_likely_well(
     values = _logarithmic(track, scale, points)
     at = largest(values)
     copy_line(points[at], best)
-    value, apart = values[at], _FIRST
-    for _ in range(_MOST_ROUNDS):
+    # first distance of the compared points
+    value, apart = values[at], 0.3
+    for _ in range(100):
         for k in range(9):
             square[k, 0], square[k, 1] = best[0] + (k // 3 - 1) * apart, best[1]
             square[k, 1] += (k % 3 - 1) * apart

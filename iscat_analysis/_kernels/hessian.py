@@ -33,7 +33,6 @@ ROWS = 15
 PAIRS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3))
 """Indices into (x, y, z, a) of the second derivatives, from row 5 on."""
 
-_CHANNELS = 4  # of the first order of a radial profile
 _FIELDS = 12  # rows of scratch: four channels, their slopes and second derivatives
 _DISTANCE = _FIELDS + DISTANCE  # after as many of ∂z, ∂zz and slopes of ∂z
 _DX, _DY, _WAVES = _DISTANCE + 1, _DISTANCE + 2, _DISTANCE + 3
@@ -94,7 +93,7 @@ def _add_derivatives(
     for j in range(_STRIP):
         f[_DISTANCE, j] = f[DISTANCE, j] = np.sqrt(dx[j] * dx[j] + dy[j] * dy[j]) * lens.inv_step
     evaluate_bends(profile, f)
-    if profile.shape[2] > _CHANNELS:
+    if profile.shape[2] > 4:  # channels of the first order
         evaluate_last_slopes(profile, f[_FIELDS:])
     else:
         f[_FIELDS:_DISTANCE] = 0.0

@@ -35,7 +35,6 @@ from numba.misc.appdirs import AppDirs
 
 _SOURCES = os.path.dirname(__file__)  # noqa: PTH120  # kernels know no paths
 _PREFIX = "iscat-kernels-"
-_UNUSED_S = 30 * 86400.0  # after which a folder is removed
 
 
 def _state(path: str) -> tuple[int, int]:
@@ -106,7 +105,7 @@ def _remove_unused(parent: str) -> None:
     with suppress(OSError):  # another process removes them as well
         for entry in os.scandir(parent):
             unused_s = time.time() - entry.stat().st_mtime
-            if entry.name.startswith(_PREFIX) and unused_s > _UNUSED_S:
+            if entry.name.startswith(_PREFIX) and unused_s > 30 * 86400.0:
                 shutil.rmtree(entry.path, ignore_errors=True)
 
 

@@ -16,7 +16,6 @@ Species = tuple[FloatArray, FloatArray, FloatArray]
 """Weights, means μ and variances τ² of species (k,)."""
 
 _LOG_2PI = math.log(2.0 * math.pi)
-_CERTAIN_SIGMAS = 9.0  # standard deviations above the threshold: the probability is 1
 _TINY = 1e-250  # smaller densities are added by their logarithms
 _BLOCK = 128  # events whose numbers fit into the cache
 # Ln 2; the first has few digits
@@ -184,7 +183,8 @@ def detection_score(
         for j in range(k):
             reach[j] = 1.0 / math.sqrt(variance[j] + noise[i])
             at[j] = (mean[j] - threshold) * reach[j]
-            if at[j] > _CERTAIN_SIGMAS:
+            # standard deviations above the threshold: the probability is 1
+            if at[j] > 9.0:
                 part[j], edge[j] = weight[j], 0.0
             else:
                 part[j] = weight[j] * 0.5 * math.erfc(-at[j] * math.sqrt(0.5))

@@ -34,8 +34,6 @@ SERIES = 0.2
 FLOOR = 1e-150
 """Smallest expected count or intensity: keeps quotients and their squares finite if a dark fringe
 or a masked pixel is exactly zero."""
-_DARK = 1e-100  # expected light below which a pixel has no information on relative changes
-_LEAST_COUNT = 1e-9  # of a tail
 _WHOLE = 1e-9  # rounding of whole counts
 
 
@@ -219,7 +217,8 @@ def residuals_of_row(
             rate[j] = max(raw + c3[j], FLOOR)
             t[0, j] = light * light / rate[j]
             t[1, j] = light * (c0[j] - rate[j]) / rate[j]
-            t[2, j] = c2[j] * level / light if light > _DARK else 0.0
+            # expected light below which a pixel has no information on relative changes
+            t[2, j] = c2[j] * level / light if light > 1e-100 else 0.0
             t[3, j] = 1.0 / rate[j] if used else 0.0
     if kind == CONDITIONAL:
         for j in range(s.size):
@@ -246,7 +245,7 @@ def tail_of_pixel(
     if kind == CONDITIONAL:
         # read noise reduces the counts by its share of the variance, as if they were lost
         n, k, p = share * total, share * (observed if above else total - observed), mean / total
-        a = min(max(k, _LEAST_COUNT), n)
+        a = min(max(k, 1e-9), n)
         known, b, x = k > 0.0, n - a + 1.0, p if above else 1.0 - p
     else:
         k = max(np.floor(observed + _WHOLE), 0.0)

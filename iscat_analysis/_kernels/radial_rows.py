@@ -136,7 +136,6 @@ def evaluate_bends(profile: FloatArray, f: FloatArray) -> None:
 _DX, _DY, SUMS = DISTANCE + 1, DISTANCE + 2, DISTANCE + 3
 """Rows of scratch after those of the quintics: dx, dy, and the sums over the samples."""
 
-_SCRATCH = SUMS + 5
 _STRIP = 256  # pixels, or one row if it has more
 
 
@@ -222,7 +221,7 @@ def _add_parts(lens: RoundLens, weight: float, f: FloatArray) -> None:
 def strip_scratch(pixels: Pixels) -> tuple[int, FloatArray]:
     """Rows of pixels in a strip, and its scratch."""
     together = min(max(_STRIP // pixels.x.size, 1), pixels.y.size)
-    return together, np.empty((_SCRATCH, padded(together * pixels.x.size)))
+    return together, np.empty((SUMS + 5, padded(together * pixels.x.size)))
 
 
 @kernel()

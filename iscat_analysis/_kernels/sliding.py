@@ -86,9 +86,6 @@ def contrast_map(earlier: MapArray, later: MapArray, weight: MapArray) -> MapArr
     return np.asarray(weight * (stretch - 1.0), dtype=np.float32)
 
 
-_LEAST_KNOWN = 1e-9  # of a sum of squares that is left beside a mean, and is not rounding
-
-
 @kernel()
 def best_line(
     frames: IntArray,
@@ -119,7 +116,8 @@ def best_line(
             along += weight[k] * share * heights[k]
         along -= new / light * level
         known = squares - new * new / light
-        if along > 0 and known > _LEAST_KNOWN * squares:
+        # of the sum of squares, that is left beside the mean and is not rounding
+        if along > 0 and known > 1e-9 * squares:
             gain = 0.5 * along * along / known
             if gain > least:
                 least, found = gain, centre

@@ -18,9 +18,6 @@ from iscat_analysis._kernels.stamp import BENDS
 PART = 0.5
 """Steps, in standard deviations, of the differences that give second derivatives."""
 
-_SINGULAR = 1e-9
-"""Pivot of a matrix with ones on its diagonal below which a parameter is undetermined."""
-
 
 @kernel(fastmath=FAST, _nrt=False)
 def _add_curvature(
@@ -252,7 +249,8 @@ def _directions(fisher: FloatArray, index: IntArray, out: FloatArray) -> bool:
     if not factorise(fisher, index, scale, 0.0, low):
         return False
     for i in range(n):
-        if not low[i, i] ** 2 > _SINGULAR:
+        # pivot of a matrix with ones on its diagonal below which a parameter is undetermined
+        if not low[i, i] ** 2 > 1e-9:
             return False
     out[:] = 0.0
     for k in range(n):  # column k of L⁻ᵀ
