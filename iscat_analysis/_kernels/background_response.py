@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels import FAST, AnyFloatArray, FloatArray, IntArray, kernel
+from iscat_analysis._kernels import FAST, AnyFloatArray, FloatArray, IntArray, SingleArray, kernel
 from iscat_analysis._kernels.canvas import Light
 from iscat_analysis._kernels.loops import copy_line, factorise, solve
 
@@ -58,7 +58,7 @@ class Clusters(NamedTuple):
 @kernel(fastmath=FAST, _nrt=False)
 def keep_slopes(
     level: FloatArray, gradient: AnyFloatArray, index: IntArray, slopes: Slopes, row: int,
-    square: tuple[int, int, int, int], room: NDArray[np.float32],
+    square: tuple[int, int, int, int], room: SingleArray,
 ) -> None:  # fmt: skip
     """Store level × gradient of the free parameters of a row; `room` is work space for one."""
     for i in range(4):
@@ -148,7 +148,7 @@ def find_clusters(squares: IntArray, starts: IntArray, owner: IntArray) -> None:
 
 @kernel()
 def join_rows(
-    slopes: Slopes, clusters: Clusters, light: Light, totals: NDArray[np.float32],
+    slopes: Slopes, clusters: Clusters, light: Light, totals: SingleArray,
     information: FloatArray, first: int, last: int,
 ) -> None:  # fmt: skip
     """Factorise the information on the rows of some clusters, and let them respond to each other.
@@ -200,8 +200,8 @@ def join_rows(
 
 @kernel(fastmath=FAST, _nrt=False)
 def _overlap(
-    slopes: Slopes, light: Light, t: int, total: NDArray[np.float32], r: int, s: int,
-    work: NDArray[np.float32], out: FloatArray,
+    slopes: Slopes, light: Light, t: int, total: SingleArray, r: int, s: int,
+    work: SingleArray, out: FloatArray,
 ) -> bool:  # fmt: skip
     """Fill `out` (k, k) with the information that two rows share; tell whether they do.
 
@@ -236,7 +236,7 @@ def _overlap(
 @kernel(fastmath=FAST, _nrt=False)
 def _copy_part(
     slopes: Slopes, row: int, k: int, width: int, top: int, left: int, nx: int, size: int,
-    out: NDArray[np.float32],
+    out: SingleArray,
 ) -> None:  # fmt: skip
     """Fill `out` with a part of a slope: lines of nx pixels from a square of some width."""
     slope, unit = slopes.values[row, k], np.float32(slopes.units[row, k])

@@ -21,6 +21,7 @@ import numpy as np
 from iscat_analysis._kernels import FloatArray, kernel
 from iscat_analysis._kernels.lattice import TAPS, interpolate_columns, lattice_row
 from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, LatticeLens, Lens, Pixels, RoundLens
+from iscat_analysis._kernels.loops import copy_line
 from iscat_analysis._kernels.radial_rows import (
     SUMS,
     radial_parts,
@@ -78,10 +79,9 @@ def signal_gradient(
         last = min(first + together, rows)
         fill_strip(profile, lens, pixels, theta, first, last, begun)
         for row in range(first, last):
+            start = (row - first) * columns
             for k in range(5):
-                here, there = lines[k, (row - first) * columns :], out[row, k]
-                for j in range(columns):
-                    there[j] = here[j]
+                copy_line(lines[k, start : start + columns], out[row, k])
 
 
 @kernel()

@@ -10,9 +10,8 @@ assignment of slices also the text of its error message: this takes a second or 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from iscat_analysis._kernels import FAST, FloatArray, IntArray, kernel
+from iscat_analysis._kernels import FAST, BoolArray, FloatArray, IntArray, kernel
 
 
 @kernel(_nrt=False)
@@ -49,7 +48,7 @@ def largest(values: FloatArray) -> int:
 
 
 @kernel()
-def marked(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
+def marked(flags: BoolArray) -> IntArray:
     """Give the indices of the true flags (n)."""
     out, count = np.empty(flags.size, dtype=np.int64), 0
     for i in range(flags.size):

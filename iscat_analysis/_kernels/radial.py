@@ -26,10 +26,9 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import hyp0f1
 
-from iscat_analysis._kernels import FloatArray, kernel
+from iscat_analysis._kernels import ComplexArray, FloatArray, kernel
 from iscat_analysis._kernels.loops import whole
 from iscat_analysis._kernels.vectors import LANES, Code, instructions
 
@@ -109,8 +108,8 @@ def _add_four(
 @kernel(fastmath={"contract", "reassoc", "nsz"})
 def radial_profile(
     table: FloatArray,
-    source: NDArray[np.complex128],
-    axial: NDArray[np.complex128],
+    source: ComplexArray,
+    axial: ComplexArray,
     z_nm: float,
     orders: int,
     nodes: FloatArray,

@@ -20,7 +20,7 @@ import numpy as np
 
 from iscat_analysis._kernels import FAST, FloatArray, kernel
 from iscat_analysis._kernels.lens import Pixels, RoundLens
-from iscat_analysis._kernels.loops import whole
+from iscat_analysis._kernels.loops import copy_line, whole
 from iscat_analysis._kernels.radial import POWERS
 from iscat_analysis._kernels.vectors import LANES, Code, instructions
 
@@ -261,9 +261,8 @@ def radial_parts(
         last = min(first + together, rows)
         radial_strip(profile, lens, pixels, theta, first, last, 2, f)
         for k in range(2):
-            here, there = f[SUMS + k], out[k, first * columns : last * columns]
-            for j in range(there.size):
-                there[j] = here[j]
+            strip = f[SUMS + k, : (last - first) * columns]
+            copy_line(strip, out[k, first * columns : last * columns])
 
 
 @kernel(fastmath=FAST)

@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels import BoolArray, FloatArray, IntArray, kernel
+from iscat_analysis._kernels import BoolArray, FloatArray, IntArray, SingleArray, kernel
 from iscat_analysis._kernels.loops import whole
-
-MapArray = NDArray[np.float32]
 
 
 @kernel()
@@ -74,7 +72,7 @@ def frame_totals(counts: NDArray[Any], zero: Any, out: NDArray[Any], same: BoolA
                     break
 
 
-def contrast_map(earlier: MapArray, later: MapArray, weight: MapArray) -> MapArray:
+def contrast_map(earlier: SingleArray, later: SingleArray, weight: SingleArray) -> SingleArray:
     """Weighted contrast of two sums over the field, minus its weighted mean.
 
     Shapes: `earlier, later` (k, y, x), `weight` (y, x), result (y, x).
