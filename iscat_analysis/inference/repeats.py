@@ -119,7 +119,8 @@ def series_of(
     """
     lit, number = power > 0, len(weights)
     seen = weights * gain
-    values = seen.reshape(number, -1) @ counts[lit].reshape(-1, seen[0].size).T
+    pixels = counts[lit].reshape(-1, seen[0].size).astype(np.float64)
+    values = seen.reshape(number, -1) @ pixels.T
     values -= np.sum(seen * offset, axis=(1, 2))[:, None]
     squared = weights.reshape(number, -1) ** 2
     shot, read = (squared @ e.ravel() for e in (np.maximum(mean_e, 0.0), read_variance_e2))
