@@ -249,7 +249,8 @@ def _chosen(table: pd.DataFrame, file: Path, called: str) -> BoolArray:
                 f"{file}: {called} has no event {particle.event} at frame {particle.frame}: the "
                 "selection is of another result"
             )
-    return kept & ~table["event"].isin([one.event for one in selection.rejected]).to_numpy(bool)
+    rejected = table["event"].isin([one.event for one in selection.rejected])
+    return np.asarray(kept & ~rejected.to_numpy(bool))
 
 
 def filter_efficiency(
