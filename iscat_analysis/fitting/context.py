@@ -225,8 +225,9 @@ def square_of(config: Config, field_px: tuple[int, int]) -> tuple[float, int]:
 def square_model(config: Config, pixel_nm: float, roi_px: int) -> ForwardModel:
     """Build the forward model of the square that is fitted."""
     margin = pixel_nm + margin_nm(config.optics, pixel_nm)
-    reach_nm = roi_px * pixel_nm / 2 + window_nm(pixel_nm) + margin
-    return forward_model(config, math.sqrt(2) * reach_nm)
+    return forward_model(
+        config, math.sqrt(2) * (roi_px * pixel_nm / 2 + window_nm(pixel_nm) + margin)
+    )
 
 
 def search_both(detection: Detection, *, searches: int = 1) -> Detection:

@@ -122,8 +122,11 @@ def evidence_beside(
 def _line(
     context: AnalysisContext, event: Event, quantum: Mapping[float, ComplexArray]
 ) -> dict[str, Any]:
-    line: dict[str, Any] = {"frame": event.frame}
-    line |= {"n_before": event.n_before, "n_after": event.n_after}
+    line: dict[str, Any] = {
+        "frame": event.frame,
+        "n_before": event.n_before,
+        "n_after": event.n_after,
+    }
     line |= line_of(
         event.likelihood, event.fit, collected_photons(context, event), event.flags,
         sign=event.sign,

@@ -371,8 +371,8 @@ def top_of(weight: FloatArray, mean: FloatArray, total: FloatArray) -> float:
 def _density(
     grid: FloatArray, weight: FloatArray, mean: FloatArray, total: FloatArray
 ) -> FloatArray:
-    bells = np.exp(-0.5 * (grid[:, None] - mean) ** 2 / total) / np.sqrt(total)
-    return np.asarray(bells @ weight)
+    bells: FloatArray = np.exp(-0.5 * (grid[:, None] - mean) ** 2 / total) / np.sqrt(total)
+    return bells @ weight
 
 
 def _valleys(weight: FloatArray, mean: FloatArray, whole: FloatArray) -> FloatArray:

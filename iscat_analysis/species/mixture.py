@@ -142,8 +142,9 @@ class Mixture:
 
     def arrived(self, events: Events) -> float:
         """Give the expected number of particles that arrived, detected or not: Σ_i 1/Z_i."""
-        each = 1 / (self.chance(events) @ self.weight)
-        return float(np.sum(np.broadcast_to(each, events.x.shape)))
+        return float(
+            np.sum(np.broadcast_to(1 / (self.chance(events) @ self.weight), events.x.shape))
+        )
 
 
 _OCTAVE = math.log(2.0)
