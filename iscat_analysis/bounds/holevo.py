@@ -177,8 +177,9 @@ def _solve(information: ComplexArray, weight: FloatArray) -> FloatArray:
     # The unknowns are the upper triangle of V, then Re X and Im X.  `v` and `x` are what each of
     # them adds to V and X.
     units = np.eye(size**2).reshape(-1, size, size)
-    upper = np.triu(np.ones((size, size))).ravel() > 0
-    symmetric = np.maximum(units, units.transpose(0, 2, 1))[upper]
+    symmetric = np.maximum(units, units.transpose(0, 2, 1))[
+        np.triu(np.ones((size, size))).ravel() > 0
+    ]
     v = np.concatenate([symmetric, 0 * units, 0 * units])
     x = np.concatenate([0 * symmetric, units, 1j * units])
     # A Hermitian H = S + iT is positive where [[S, −T], [T, S]] is.  Its upper triangle goes to the

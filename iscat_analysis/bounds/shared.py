@@ -278,8 +278,9 @@ def _names(config: Config, free: str | Sequence[str] | None) -> tuple[str, ...]:
             'are learned from interference with a reference, in the convention "exact"'
         )
     settings = settings_of(config)
-    every = (name for group in free_groups(free) for name in FREE[group])
-    names = tuple(name for name in every if exists(name, settings))
+    names = tuple(
+        name for group in free_groups(free) for name in FREE[group] if exists(name, settings)
+    )
     if not names:
         raise ConfigError(f"free = {free!r}: this microscope has no such continuous parameter")
     return names

@@ -137,8 +137,9 @@ def _line(
     if event.half_width is not None:
         line[FRAME_COLUMN] = event.half_width
     if context.config.fit.pairs:
-        beside = Evidence(*evidence_of(event.likelihood, event.fit))
-        pair = pair_of(event.likelihood, event.fit, beside)
+        pair = pair_of(
+            event.likelihood, event.fit, Evidence(*evidence_of(event.likelihood, event.fit))
+        )
         line |= pair._asdict() | {"pair_mass_kda": event.sign * pair.pair_mass_kda}
     return line
 

@@ -249,8 +249,8 @@ def _chosen(table: pd.DataFrame, file: Path, called: str) -> BoolArray:
                 f"{file}: {called} has no event {particle.event} at frame {particle.frame}: the "
                 "selection is of another result"
             )
-    rejected = table["event"].isin([one.event for one in selection.rejected])
-    return np.asarray(kept & ~rejected.to_numpy(bool))
+    kept &= ~table["event"].isin([one.event for one in selection.rejected]).to_numpy(bool)
+    return kept
 
 
 def filter_efficiency(
