@@ -194,8 +194,7 @@ class MergedChunks:
     def __init__(self, shape: tuple[int, int], ends: Sequence[int] = ()) -> None:
         self._done: list[FinishedChunk] = []
         self._ends = set(ends)  # of the stretches of the movie
-        self._dated: dict[int, NDArray[np.int64]] = {}
-        self._sampled: dict[int, int] = {}
+        self._noted: dict[int, tuple[NDArray[np.int64], int]] = {}  # dates, and what is sampled
         self._strongest = np.zeros((2, *shape), dtype=np.float32)
         self._masked, self._saturated = (np.zeros(shape, dtype=np.bool_) for _ in range(2))
         self.cause = ""
@@ -206,18 +205,18 @@ class MergedChunks:
     def note(self, number: int, done: FinishedChunk) -> None:
         """Register the events of a finished chunk, which may not be the next one in order."""
         frame = done.lines["frame"].to_numpy() if len(done.lines) else np.empty(0, dtype=np.int64)
-        self._sampled[number] = done.sampled
-        self._dated[number] = frame[(frame >= done.core[0]) & (frame < done.core[1])]
+        dated = frame[(frame >= done.core[0]) & (frame < done.core[1])]
+        self._noted[number] = dated, done.sampled
 
     @property
     def sampled(self) -> int:
         """Events whose posterior is sampled."""
-        return sum(self._sampled.values())
+        return sum(sampled for _, sampled in self._noted.values())
 
     def earlier(self, number: int, frame: int) -> int:
         """Count the events before a frame in finished chunks before a given one."""
-        known = list(self._dated.items())  # other threads note theirs
-        return sum(int((dated < frame).sum()) for n, dated in known if n < number)
+        known = list(self._noted.items())  # other threads note theirs
+        return sum(int((dated < frame).sum()) for n, (dated, _) in known if n < number)
 
     def add(self, done: FinishedChunk) -> None:
         """Append the next chunk."""
@@ -545,17 +544,13 @@ def analyse_chunk(
         steps = _near_core(steps, tile, context.pixel_nm)
     events = [step.event for step in steps]
     chains: dict[int, PosteriorResult] = {}
+    of_core = [n for n, event in enumerate(events) if core[0] <= event.frame < core[1]]
     stopped = False
-    for number, event in enumerate(events):
-        if len(chains) >= posteriors:
-            break
-        if not core[0] <= event.frame < core[1]:
-            continue
-        try:
-            chains[number] = posterior_of(context, event, event.frame)
-        except KeyboardInterrupt:  # the fits are done, and kept
-            stopped = True
-            break
+    try:
+        for n in of_core[:posteriors]:
+            chains[n] = posterior_of(context, events[n], events[n].frame)
+    except KeyboardInterrupt:  # the fits are done, and kept
+        stopped = True
     shown = fitter.shown(
         steps[: _shown_of(tile, VIEWS - earlier)], _shown_of(tile, CLIPS - earlier)
     )

@@ -225,25 +225,14 @@ def ring_average(
     # between knots; rings are half a wavelength apart, some two pixels
     radius = np.hypot(y[:, None], x[None, :]).ravel() / 0.6
     angle = np.arctan2(y[:, None], x[None, :] + 0 * y[:, None]).ravel()
-    waves = [np.ones(angle.size)]
-    for order in (1, 2):
-        waves += [np.cos(order * angle), np.sin(order * angle)]
+    turns = angle, 2 * angle
+    waves = [np.ones(angle.size), *(wave(turn) for turn in turns for wave in (np.cos, np.sin))]
     knot = np.floor(radius).astype(np.int64)
-    part = radius - knot
-    pixel = np.arange(radius.size)
-    number, knots = len(waves), int(knot.max()) + 2
-    design = sparse.csr_matrix(
-        (
-            np.concatenate([wave * share for wave in waves for share in (1 - part, part)]),
-            (
-                np.tile(pixel, 2 * number),
-                np.concatenate([number * (knot + s) + k for k in range(number) for s in (0, 1)]),
-            ),
-        ),
-        shape=(pixel.size, number * knots),
-    )
+    part, places = radius - knot, (np.tile(np.arange(radius.size), 2), np.append(knot, knot + 1))
+    rings = sparse.csr_matrix((np.append(1 - part, part), places))
+    design = sparse.hstack([rings.multiply(wave[:, None]) for wave in waves], format="csr")
     value, accuracy = contrast.ravel(), weight.ravel()
-    ridge = sparse.identity(number * knots) * (1e-6 * float(np.mean(accuracy**2)))
+    ridge = sparse.identity(design.shape[1]) * (1e-6 * float(np.mean(accuracy**2)))
     kept = accuracy**2
     image = np.zeros(value.size)
     # of the rings, with the outliers of the one before

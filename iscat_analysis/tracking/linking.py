@@ -45,12 +45,7 @@ from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.medians import SIGMA_PER_MAD
 from iscat_analysis.records import BoolArray, FloatArray, IntArray
 from iscat_analysis.tracking.field import MovingField
-from iscat_analysis.tracking.rows import (
-    BackgroundEstimate,
-    Judged,
-    Localizations,
-    medians_of_tracks,
-)
+from iscat_analysis.tracking.rows import BackgroundEstimate, Localizations, medians_of_tracks
 
 LEAST_SNR = 4.0
 """Signal-to-noise ratio, with its neighbours in place, that a predicted particle needs."""
@@ -298,15 +293,6 @@ def trimmed(rows: Localizations) -> Localizations:
     begun = light.groupby(rows.track).cummax()
     goes_on = light[::-1].groupby(rows.track[::-1]).cummax()[::-1]
     return rows.only((begun & goes_on).to_numpy())
-
-
-def shares_mass(rows: Localizations, judged: Judged) -> BoolArray:
-    """Tell which rows hold a part of the mass of another track.
-
-    Shapes: result (n,).
-    """
-    error = 1 / np.sqrt(np.maximum(judged.fisher[:, 3, 3], 1e-300))
-    return has_other_mass(rows.track, rows.theta[:, 3], error)
 
 
 def has_other_mass(track: IntArray, mass: FloatArray, error: FloatArray) -> BoolArray:

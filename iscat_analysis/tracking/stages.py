@@ -49,6 +49,7 @@ from iscat_analysis.tracking.linking import (
     crowded,
     extended,
     extrapolated,
+    has_other_mass,
     identified,
     linked,
     load_linker,
@@ -57,7 +58,6 @@ from iscat_analysis.tracking.linking import (
     meeting,
     numbered,
     seen,
-    shares_mass,
     trimmed,
     typical,
     typical_error,
@@ -384,7 +384,8 @@ def _judged(task: Task, state: State) -> TrackedRows:
     field, ground, rows = task.field, state.ground, state.rows
     judged = field.judge(ground, rows)
     near = meeting(rows, task.config.detection.min_separation_nm)
-    unlike = shared_mass = shares_mass(rows, judged)
+    error = 1 / np.sqrt(np.maximum(judged.fisher[:, 3, 3], 1e-300))
+    unlike = shared_mass = has_other_mass(rows.track, rows.theta[:, 3], error)
     if task.heights_free:  # a path along z takes as much of the mass, and must count
         unlike = shared_mass & crowded(rows, task.context.roi_px * task.context.pixel_nm)
     counted = state.done & field.holds(rows.theta) & ~near & ~unlike
