@@ -228,7 +228,9 @@ class ChunkFitter:
             )
         likelihood, start = task.likelihood, task.displaced(self._seated(step))
         begin, z_range = start_theta(likelihood, start), self._context.config.fit.z_range_nm
-        box = search_box(likelihood, begin, self._quick_mode, z_range, level=True)
+        # a free z is held, and found later from all heights at once
+        mode = "mass" if "mass_kda" in FREE_PARAMETERS[self._context.mode] else "localize"
+        box = search_box(likelihood, begin, mode, z_range, level=True)
         theta = begin if step.theta is None else step.theta.copy()
         if not box.free[2]:
             theta[2] = start.z_nm
@@ -286,11 +288,6 @@ class ChunkFitter:
         excess = chi2_excess(likelihood.residuals(theta))
         moved = self.neighbours.draw(step.sign, task.at, start)
         return replace(moved, theta=theta, snr=snr, excess=excess)
-
-    @property
-    def _quick_mode(self) -> str:
-        """Mode of the first fits: a free z is held, and found later from all heights at once."""
-        return "mass" if "mass_kda" in FREE_PARAMETERS[self._context.mode] else "localize"
 
     def _finish(
         self,

@@ -194,7 +194,7 @@ class TaskBuilder:
         frame = step.at.frame
         begin, end = frame - self._window, frame + self._window
         crowded = False
-        for other in sorted(close, key=lambda s: abs(s.at.frame - frame)):
+        for other in close:
             gap = other.at.kept_out(self._window)
             if other.at.frame <= frame - FEWEST_FRAMES - gap:
                 begin = max(begin, other.at.frame + gap)

@@ -9,6 +9,7 @@ neighbours.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -221,51 +222,17 @@ class StoredFrames:
         return np.ascontiguousarray(seen.array(0, stop - start)), (0, 0)
 
 
-class HeldRegions:
-    """The regions that were copied last: steps at one place ask for them in each of their fits."""
-
-    def __init__(self) -> None:
-        # Of the regions that a chunk or a tile holds.
-        self._held: LastUsed[tuple[int, NDArray[Any]]] = LastUsed(40_000_000)
-
-    def frames(
-        self,
-        wanted: slice,
-        rows: tuple[int, int],
-        columns: tuple[int, int],
-        copied: Callable[[slice, tuple[int, int], tuple[int, int]], NDArray[Any]],
-    ) -> NDArray[Any]:
-        """Give frames of a region, of which those that are not held yet are copied.
-
-        Shapes: result (t, y, x).
-        """
-        low, held = self._held.get((rows, columns)) or (wanted.start, _NO_COUNTS)
-        high = low + len(held)
-        first, last = min(low, wanted.start), max(high, wanted.stop)
-        if last - first > _SPREAD * (len(held) + wanted.stop - wanted.start):
-            return copied(wanted, rows, columns)
-        parts = [copied(slice(first, low), rows, columns)] if first < low else []
-        parts += [held] if len(held) else []
-        parts += [copied(slice(high, last), rows, columns)] if high < last or not parts else []
-        counts = parts[0] if len(parts) == 1 else np.concatenate(parts)
-        self._held.hold((rows, columns), (first, counts), counts.nbytes)
-        return counts[wanted.start - first : wanted.stop - first]
-
-
 def frames_in_place(movie: CountSource, start: int, stop: int) -> list[InPlace]:
     """Map frames where they lie, in as few runs as there are; nothing if some have to be read."""
     if not isinstance(movie, PlacedSource):
         return []
     found: list[InPlace] = []
     while start < stop:
-        run = movie.in_place(start, stop)
-        few, many = 1, stop - start  # frames of a run that is one, and that is none
-        if run is None:
-            run = movie.in_place(start, start + few)
-            while run is not None and many - few > 1:
-                middle = (few + many) // 2
-                longer = movie.in_place(start, start + middle)
-                few, many, run = (few, middle, run) if longer is None else (middle, many, longer)
+        run, first = movie.in_place(start, stop), start
+        if run is None:  # the longest that there is
+            ends = range(start + 1, stop)
+            count = bisect_left(ends, True, key=lambda end: movie.in_place(first, end) is None)
+            run = movie.in_place(start, start + count) if count else None
         if run is None:
             return []
         found.append(run)
@@ -295,7 +262,10 @@ class Chunk(FieldSums):
     check: Callable[[], None]
     let_go: Callable[[], None]  # of pages of the file, once a region was copied
     lends_blocks: bool  # whether maps may take their memory: nobody else asks for this chunk
-    _regions: HeldRegions = field(init=False, repr=False, default_factory=HeldRegions)
+    _held: LastUsed[tuple[int, NDArray[Any]]] = field(
+        init=False, repr=False, default_factory=lambda: LastUsed(40_000_000)
+    )
+    """The regions that were copied last: steps at one place ask for them in each of their fits."""
 
     @property
     def first(self) -> int:
@@ -323,7 +293,7 @@ class Chunk(FieldSums):
         self.check()
         here, pixels = self.cut(start, stop), (slice(*rows), slice(*columns))
         camera = self.camera
-        counts = self._regions.frames(here, rows, columns, self._copied)
+        counts = self._region(here, rows, columns)
         return Patch(
             first=self.first + here.start,
             counts=counts,
@@ -353,12 +323,37 @@ class Chunk(FieldSums):
         dark = np.count_nonzero(good) * _at(self.camera.offset_adu, box)
         return np.asarray(_at(self.camera.gain_e_per_adu, box) * (sums - dark))
 
+    def _region(
+        self, wanted: slice, rows: tuple[int, int], columns: tuple[int, int]
+    ) -> NDArray[Any]:
+        """Give frames of a region, of which those that are not held yet are copied.
+
+        Shapes: result (t, y, x).
+        """
+        low, held = self._held.get((rows, columns)) or (wanted.start, _NO_COUNTS)
+        high = low + len(held)
+        first, last = min(low, wanted.start), max(high, wanted.stop)
+        if last - first > _SPREAD * (len(held) + wanted.stop - wanted.start):
+            return self._copied(wanted, rows, columns)
+        parts = [self._copied(slice(first, low), rows, columns)] if first < low else []
+        parts += [held] if len(held) else []
+        if high < last or not parts:
+            parts.append(self._copied(slice(high, last), rows, columns))
+        counts = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        self._held.hold((rows, columns), (first, counts), counts.nbytes)
+        return counts[wanted.start - first : wanted.stop - first]
+
     def _copied(
         self, frames: slice, rows: tuple[int, int], columns: tuple[int, int]
     ) -> NDArray[Any]:
         """Copy a region; of a file that is let go a few frames at a time: each maps megabytes."""
         if self.let_go is _nothing or frames.stop - frames.start <= _COPIED:
-            counts = _region(self.counts, frames, rows, columns)
+            ends = zip((rows, columns), self.shape, strict=True)
+            if not all(0 <= low <= high <= size for (low, high), size in ends):
+                where = f"rows {rows} and columns {columns}"
+                raise IndexError(f"{where} of frames of shape {self.shape}")
+            seen = self.counts.array(frames.start, frames.stop, (slice(*rows), slice(*columns)))
+            counts = seen if seen.base is None else seen.copy()
             self.let_go()
             return counts
         edges = range(frames.start, frames.stop, _COPIED)
@@ -601,17 +596,6 @@ def make_chunk(
 
 def _nothing() -> None:
     """Keep the pages of the frames."""
-
-
-def _region(
-    counts: StoredFrames, frames: slice, rows: tuple[int, int], columns: tuple[int, int]
-) -> NDArray[Any]:
-    """Copy a region of some frames."""
-    ends = zip((rows, columns), counts.shape[1:], strict=True)
-    if not all(0 <= low <= high <= size for (low, high), size in ends):
-        raise IndexError(f"rows {rows} and columns {columns} of frames of shape {counts.shape[1:]}")
-    seen = counts.array(frames.start, frames.stop, (slice(*rows), slice(*columns)))
-    return seen if seen.base is None else seen.copy()
 
 
 def _at(value: float | FloatArray, here: tuple[slice, slice]) -> Any:

@@ -63,8 +63,11 @@ def summits(
     """
     layer, *place = at.T
     value = fields[layer, place[0], place[1]].astype(np.float64)
-    around = np.arange(-_REACH_PX, _REACH_PX + 1)
-    y, x = (_mirrored(c[:, None] + around, n) for c, n in zip(place, fields.shape[1:], strict=True))
+    near = np.arange(2 * _REACH_PX + 1)  # mirrored at the first and the last pixel
+    y, x = (
+        np.pad(np.arange(size), _REACH_PX, mode="reflect")[at_pixel[:, None] + near]
+        for at_pixel, size in zip(place, fields.shape[1:], strict=True)
+    )
     patches = fields[layer[:, None, None], y[:, :, None], x[:, None, :]]
     spline = _spline()
     fine = np.where(value < 0, -1.0, 1.0)[:, None, None] * (spline @ patches @ spline.T)
@@ -78,13 +81,6 @@ def summits(
     spacing = float(_FINE[1] - _FINE[0])
     above = np.maximum(height - np.abs(value), 0.0)
     return _FINE[i] + spacing * dy, _FINE[j] + spacing * dx, above
-
-
-def _mirrored(places: NDArray[np.int64], size: int) -> NDArray[np.int64]:
-    """Reflect indices outside an axis at its first and last pixel."""
-    period = max(2 * (size - 1), 1)
-    folded = places % period
-    return np.minimum(folded, period - folded) if size > 1 else np.zeros_like(places)
 
 
 @cache

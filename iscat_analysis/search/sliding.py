@@ -13,7 +13,6 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +21,7 @@ from scipy import fft
 
 from iscat_analysis._kernels.sliding import contrast_map
 from iscat_analysis.camera import NoiseSpectrum
+from iscat_analysis.last_used import kept
 from iscat_analysis.records import FloatArray, Mapper
 from iscat_analysis.search.frames import Chunk
 from iscat_analysis.search.peaks import SAMPLED, maxima, summits
@@ -81,16 +81,10 @@ class Filter:
         there = box[0], box[1]
         return there, whole[seen[0], seen[1]] / np.sqrt(self.norm[there])
 
+    @kept(64)
     def _spectrum_of(self, size: tuple[int, int]) -> NDArray[np.complex64]:
         """Give the spectrum of the reversed template, its first pixel at the origin."""
-        if size not in self._spectra:
-            reversed_ = self.template[::-1, ::-1].astype(np.float32)
-            self._spectra[size] = fft.rfft2(reversed_, s=size)
-        return self._spectra[size]
-
-    @cached_property
-    def _spectra(self) -> dict[tuple[int, int], NDArray[np.complex64]]:
-        return {}
+        return np.asarray(fft.rfft2(self.template[::-1, ::-1].astype(np.float32), s=size))
 
 
 def make_filter(chunk: Chunk, template: FloatArray, noise: NoiseSpectrum | None = None) -> Filter:

@@ -20,8 +20,7 @@ no single height describes them.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import compress
 from pathlib import Path
@@ -203,7 +202,7 @@ def _find_in_blocks(
         return TrialTracks(config, context, analysed(context, 0, folder, cautious=cautious))
 
     interrupted = False
-    with _with_resumption_hint(shelves, plan):
+    try:
         begun, learned = learn_from_tracks(
             config, begin, name=movie.name, pool=recording.pool, run=run
         )
@@ -218,6 +217,8 @@ def _find_in_blocks(
         joined = join_blocks(config, blocks)
         if not interrupted and not fixed_height_warning(config, joined.fits):
             run.report(held_height_warning(ready.config, recording, plan.spans[0], joined.fits))
+    except KeyboardInterrupt as stop:
+        raise saying(stop, _hint(shelves, plan)) from None
     windows = joined.followed.windows
     noise = () if jitter else blocks[0].noise
     run.report(*noise, *pixel_warnings(*windows.left_out))
@@ -284,22 +285,17 @@ def _find_in_dark_field(
     return replace(found, context=context, fits=fits.assign(**wider), repeats=(), empty=None)
 
 
-@contextmanager
-def _with_resumption_hint(shelves: Sequence[BlockStore], plan: Plan) -> Iterator[None]:
-    """Add to an interrupt whether a block was finished, from which the same command resumes."""
-    try:
-        yield
-    except KeyboardInterrupt as stop:
-        if any(shelf.kept for shelf in shelves):
-            raise saying(stop, RESUMPTION_HINT) from None
-        parts = f"in {len(plan.spans)} of them, of which the first is not"
-        if len(plan.spans) == 1:
-            parts = f"in one of {plan.frames} frames, which is not"
-        nothing = (
-            "nothing is kept, and the same command begins anew: tracks are kept when a block of "
-            f"frames is done, and this movie is analysed {parts}"
-        )
-        raise saying(stop, nothing) from None
+def _hint(shelves: Sequence[BlockStore], plan: Plan) -> str:
+    """Say whether a block was finished, from which the same command resumes."""
+    if any(shelf.kept for shelf in shelves):
+        return RESUMPTION_HINT
+    parts = f"in {len(plan.spans)} of them, of which the first is not"
+    if len(plan.spans) == 1:
+        parts = f"in one of {plan.frames} frames, which is not"
+    return (
+        "nothing is kept, and the same command begins anew: tracks are kept when a block of "
+        f"frames is done, and this movie is analysed {parts}"
+    )
 
 
 def _nothing_found(context: AnalysisContext, block: Block, name: str) -> Finding:

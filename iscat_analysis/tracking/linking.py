@@ -325,13 +325,8 @@ def meeting(rows: Localizations, limit_nm: float) -> BoolArray:
     near = crowded(rows, limit_nm)
     apart = _MEETING + 1  # between tracks, so that frames of one are not near those of another
     when = rows.track * (int(rows.frame.max(initial=0)) + apart) + rows.frame
-    times = np.sort(when[near])
-    if not times.size:
-        return near
-    after = np.searchsorted(times, when).clip(0, times.size - 1)
-    before = np.maximum(after - 1, 0)
-    gap = np.minimum(np.abs(times[after] - when), np.abs(times[before] - when))
-    return np.asarray(gap <= _MEETING)
+    around = when[near][:, None] + np.arange(-_MEETING, _MEETING + 1)
+    return np.isin(when, around)
 
 
 def bridge(config: Config, rows: Localizations) -> IntArray:

@@ -11,14 +11,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera import Camera
 from iscat_analysis.search.dating import crosstalk, locate_step
-from iscat_analysis.search.frames import (
-    Chunk,
-    HeldRegions,
-    Patch,
-    StoredFrames,
-    make_chunk,
-    measure_frames,
-)
+from iscat_analysis.search.frames import Chunk, Patch, StoredFrames, make_chunk, measure_frames
 from iscat_analysis.search.noise import NoiseCurve, choose_window, longest_window, measure_noise
 from iscat_analysis.search.sliding import find_steps, make_filter, sliding_maps
 from iscat_analysis.threads import threads
@@ -96,17 +89,18 @@ def test_maps_of_the_camera_enter_pixel_by_pixel() -> None:
     )
 
 
-def test_frames_of_a_region_are_copied_once() -> None:
+def test_frames_of_a_region_are_copied_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever is asked for between, before and behind them, and of places that are long ago."""
-    counts = np.random.default_rng(2).integers(0, 200, (300, 8, 9)).astype("u2")
-    held, copied = HeldRegions(), []
+    chunk, copied, copy = _chunk(_movie(300, 2)), [], Chunk._copied
+    counts = chunk.counts.array(0, 300)
 
-    def copy(frames: slice, rows: tuple[int, int], columns: tuple[int, int]) -> NDArray[Any]:
+    def noted(self: Chunk, frames: slice, *region: tuple[int, int]) -> NDArray[Any]:
         copied.append(frames.stop - frames.start)
-        return counts[frames, slice(*rows), slice(*columns)].copy()
+        return copy(self, frames, *region)
 
+    monkeypatch.setattr(Chunk, "_copied", noted)
     for start, stop in ((50, 80), (60, 70), (40, 60), (75, 100), (45, 95), (280, 300), (90, 90)):
-        found = held.frames(slice(start, stop), (2, 6), (1, 9), copy)
+        found = chunk.patch(start, stop, (2, 6), (1, 9)).counts
         np.testing.assert_array_equal(found, counts[start:stop, 2:6, 1:9])
     assert copied == [30, 10, 20, 20]
 
