@@ -30,11 +30,11 @@ from iscat_analysis.tracking.frames import (
     LEAST_FRAMES,
     Recording,
     exposure_of,
-    initial_background,
     load_field,
     restore_particle_light,
     tracking_context,
 )
+from iscat_analysis.tracking.joint import first_background
 from iscat_analysis.tracking.rows import NO_ROWS, BackgroundEstimate, Localizations
 from iscat_analysis.tracking.search import search_frames
 from iscat_analysis.tracking.stages import blurred_rows
@@ -80,7 +80,7 @@ class MovingSearch:
 
     def __init__(self, ready: Prepared) -> None:
         movie, config, camera = ready.steady, ready.config, ready.camera
-        self._config, check = config, checked(movie, camera)
+        check = checked(movie, camera)
         self.frames = first, last = fitted_frames(movie, config)
         self.longest = last - first
         self.window = min(100, self.longest)  # frames that make the background of one
@@ -91,7 +91,7 @@ class MovingSearch:
             with threads(config.compute.workers) as pool:
                 recording = Recording(movie, camera, check, pool, silent)
                 field = load_field(self._context, recording, span)
-                return field, initial_background(config, field)
+                return field, first_background(field, config.background)
 
         self._background = background
 
@@ -166,15 +166,15 @@ class StoredTracks:
             recording = Recording(movie, camera, check, pool, silent)
             field = load_field(context, recording, (start, stop))
             field.set_blurs(variances)
-            follows = config.background.power_normalization
-            ground = initial_background(config, field)
+            ways = config.background
+            ground = first_background(field, ways)
             restore_particle_light(context, recording, start, field, ground, rows)
             # of level and power of a background under particles that are known
             for _ in range(3):
                 found = field.fit(ground, rows, sweeps=0)[1]
-                learnt = config.background.learnt_with_tracks
-                level = found.level if learnt else ground.level
-                ground = BackgroundEstimate(level, found.power if follows else ground.power)
+                level = found.level if ways.learnt_with_tracks else ground.level
+                power = found.power if ways.power_normalization else ground.power
+                ground = BackgroundEstimate(level, power)
         return field, ground, rows, inside[order]
 
     def __call__(self, row: int) -> EventView:

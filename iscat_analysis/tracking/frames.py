@@ -52,7 +52,6 @@ from iscat_analysis.movie import SelectedFrames, Stack
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, IntArray, Progress, Windows
 from iscat_analysis.search.frames import DARK, measure_frames, well_lit
 from iscat_analysis.tracking.field import Exposures, MovingField
-from iscat_analysis.tracking.joint import first_background
 from iscat_analysis.tracking.rows import BackgroundEstimate, Localizations
 from iscat_analysis.units import count, listed
 
@@ -334,14 +333,6 @@ def tracking_context(
     fit = config.fit.model_copy(update={"mode": config.track.free})
     tracked = config.model_copy(update={"fit": fit})
     return make_context(tracked, field_px, searches=frames, lines=lines)
-
-
-def initial_background(config: Config, field: MovingField) -> BackgroundEstimate:
-    """Give the background before there are tracks: the median of the frames."""
-    ground = first_background(field, follow_power=config.background.power_normalization)
-    if config.background.method == "fixed":
-        ground = replace(ground, level=np.maximum(field.total_e / ground.power.sum(), 1e-3))
-    return ground
 
 
 def load_field(

@@ -38,6 +38,7 @@ import numpy as np
 import scipy
 
 from iscat_analysis._kernels.background_response import Slopes, follow, own_shares, send
+from iscat_analysis.config import BackgroundConfig
 from iscat_analysis.medians import middle
 from iscat_analysis.records import BoolArray, FloatArray, IntArray
 from iscat_analysis.tracking.field import BLOCK, MovingField
@@ -111,11 +112,16 @@ def log_likelihood(field: MovingField, ground: BackgroundEstimate, rows: Localiz
     return float(each[field.used].sum() + field.frame_totals @ np.log(power))
 
 
-def first_background(field: MovingField, *, follow_power: bool) -> BackgroundEstimate:
-    """Median of frames, each over its power; of a long movie, of some that are spread over it."""
+def first_background(field: MovingField, background: BackgroundConfig) -> BackgroundEstimate:
+    """Median of frames, each over its power, or the mean of all where the background is fixed.
+
+    Of a long movie it is that of some frames that are spread over it.
+    """
     power = np.ones(field.frames)
-    if follow_power:
+    if background.power_normalization:
         power = field.frame_totals / field.frame_totals.mean()
+    if background.method == "fixed":
+        return BackgroundEstimate(np.maximum(field.total_e / power.sum(), 1e-3), power)
     # 400 frames suffice: particles are found over their median, and fitted over a better one
     some = slice(None, None, max(field.frames // 400, 1))
     scale = (1 / power[some]).astype(np.float32)
@@ -133,13 +139,13 @@ def fit_jointly(
     field: MovingField,
     ground: BackgroundEstimate,
     rows: Localizations,
+    background: BackgroundConfig,
     *,
-    follow_power: bool,
-    follow_level: bool = True,
     turns: int = MOST_TURNS,
     coarse: bool = False,
 ) -> tuple[Localizations, BackgroundEstimate, BoolArray]:
     """Fit rows and background in turn until neither changes."""
+    follow_power, follow_level = background.power_normalization, background.learnt_with_tracks
     sigma = 1 / np.sqrt(np.maximum(field.total_e, 1.0))
     least, foreseen = _ROUGH_STEP if coarse else _SETTLED, _NEXT_STEP_SETTLED
     # In few frames particles hardly leave their places: what lies between the background and a

@@ -31,7 +31,6 @@ from iscat_analysis.tracking.field import BLOCK, MovingField
 from iscat_analysis.tracking.frames import (
     Recording,
     exposure_of,
-    initial_background,
     load_field,
     restore_particle_light,
 )
@@ -39,6 +38,7 @@ from iscat_analysis.tracking.joint import (
     MOST_TURNS,
     CommonAmplitudes,
     common_amplitudes,
+    first_background,
     fit_jointly,
     shared_errors,
     variances_left,
@@ -203,16 +203,8 @@ class Task:
 
     def fitted(self, state: State, turns: int = MOST_TURNS, *, coarse: bool = True) -> State:
         """Fit rows and background in turn."""
-        ways = self.config.background
-        rows, ground, done = fit_jointly(
-            self.field,
-            state.ground,
-            state.rows,
-            turns=turns,
-            coarse=coarse,
-            follow_power=ways.power_normalization,
-            follow_level=ways.learnt_with_tracks,
-        )
+        movie = self.field, state.ground, state.rows, self.config.background
+        rows, ground, done = fit_jointly(*movie, turns=turns, coarse=coarse)
         return replace(state, rows=rows, ground=ground, done=done)
 
     def in_fringes(self, state: State) -> State:
@@ -368,7 +360,7 @@ def find_rows_and_background(
     """Find and fit every particle in every frame."""
     field, progress = load_field(context, recording, span), recording.progress
     task = Task(context, recording, span[0], field, inner, cautious)
-    ground = initial_background(context.config, field)
+    ground = first_background(field, context.config.background)
     state = State(NO_ROWS, ground, np.zeros(0, dtype=np.bool_), np.zeros(1), np.zeros((0, 2)))
     for number, stage in enumerate(STAGES):
         progress("track", number, len(STAGES) + 1)

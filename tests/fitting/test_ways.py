@@ -26,12 +26,8 @@ from iscat_analysis.pipeline import analyse
 from iscat_analysis.pipeline.kinds import kind_of
 from iscat_analysis.records import EVENT_COLUMNS, SEVERITY, Analysis, Status, Windows, silent
 from iscat_analysis.study import Movie
-from iscat_analysis.tracking.frames import (
-    Recording,
-    initial_background,
-    load_field,
-    tracking_context,
-)
+from iscat_analysis.tracking.frames import Recording, load_field, tracking_context
+from iscat_analysis.tracking.joint import first_background
 
 SIDE = 48
 PLACES = ((14.3, 15.7), (33.2, 31.6))
@@ -220,7 +216,7 @@ def test_a_background_of_all_frames_is_their_mean_or_their_median(method: str) -
         span = (0, len(counts))
         recording = Recording(Stack(counts), camera, lambda *_: None, pool, silent)
         field = load_field(context, recording, span)
-        ground = initial_background(config, field)
+        ground = first_background(field, config.background)
     light = counts * 8.0 / ground.power[:, None, None]
     middle = {"fixed": np.mean, "median": np.median}[method](light, axis=0)
     np.testing.assert_allclose(ground.level, middle, rtol=3e-4)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scenes import PIXEL_NM, make_config
 
+from iscat_analysis.config import BackgroundConfig
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.tracking import joint as common
 from iscat_analysis.tracking.field import Exposures, MovingField
@@ -26,6 +27,7 @@ from iscat_analysis.tracking.rows import BackgroundEstimate, Judged, Localizatio
 
 SHAPE, FRAMES, LEVEL_E, ROI, MASS = (30, 30), 40, 4e5, 20, 400.0
 TRIALS, SIGMAS = 40, 4.0
+LEARNT = BackgroundConfig(method="tracks", power_normalization=False)
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +111,7 @@ def test_common_mass_and_shared_errors_are_right(
     for _ in range(TRIALS):
         field = _field(model, rng.poisson(mean), pool)
         start = BackgroundEstimate(mean.mean(axis=0), np.ones(FRAMES))
-        rows, ground, done = fit_jointly(field, start, truth, follow_power=False)
+        rows, ground, done = fit_jointly(field, start, truth, LEARNT)
         judged = field.judge(ground, rows)
         shared = shared_errors(field, ground, rows, judged)
         found = common_amplitudes(field, ground, rows, judged, done)

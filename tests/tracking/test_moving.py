@@ -21,7 +21,7 @@ from iscat_analysis._kernels.canvas import Light
 from iscat_analysis._kernels.hessian import first_order_bias
 from iscat_analysis._kernels.moving import Search
 from iscat_analysis._kernels.stamp import add_stamp
-from iscat_analysis.config import Config
+from iscat_analysis.config import BackgroundConfig, Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.counts import poisson
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
@@ -42,6 +42,7 @@ SHAPE, FRAMES, LEVEL_E, ROI = (40, 44), 60, 4e5, 24
 MASSES = (200.0, 400.0)
 READ_E2 = 900.0
 SIGMAS = 4.0
+LEARNT = BackgroundConfig(method="tracks")
 SAME = 1e-5  # as exact as the samples of a picture
 SINGLE = 3e-7  # rounding of 1 in single precision, a few times
 SECOND = 1e-4  # the same, of second derivatives
@@ -163,7 +164,7 @@ def test_particles_that_hardly_move_end_at_the_maximum(
     field = _field(counts, pool)
 
     def height(by: float) -> float:
-        rows, found, _ = fit_jointly(field, ground, _stretched(truth, by), follow_power=True)
+        rows, found, _ = fit_jointly(field, ground, _stretched(truth, by), LEARNT)
         return log_likelihood(field, found, rows)
 
     starts = (0.7, 1.0, 1.4)
@@ -189,9 +190,9 @@ def test_background_takes_nothing_of_particles(
     """
     counts, ground, truth = _movie(_paths(step_nm), noise=False)
     field = _field(counts, pool)
-    start = first_background(field, follow_power=True)
+    start = first_background(field, LEARNT)
     over_median, _, _ = field.fit(start, truth)
-    rows, found, done = fit_jointly(field, start, truth, follow_power=True)
+    rows, found, done = fit_jointly(field, start, truth, LEARNT)
     taken = 1 - over_median.theta[:, 3] / truth.theta[:, 3]
     left = rows.theta[:, 3] / truth.theta[:, 3] - 1
     assert done.all()
@@ -204,8 +205,8 @@ def test_fixed_point_is_the_maximum_of_the_multinomial(pool: ThreadPoolExecutor)
     """Its gradient on a row's square, by differences, vanishes within the tolerance of a fit."""
     counts, _, truth = _movie(_paths(40.0), noise=True)
     field = _field(counts, pool)
-    start = first_background(field, follow_power=True)
-    rows, ground, _ = fit_jointly(field, start, truth, follow_power=True)
+    start = first_background(field, LEARNT)
+    rows, ground, _ = fit_jointly(field, start, truth, LEARNT)
     for _ in range(3):  # beyond what is asked of it
         rows, found, _ = field.fit(ground, rows)
         ground = BackgroundEstimate(found.level, ground.power)
@@ -455,8 +456,8 @@ def test_counts_are_fitted_as_the_photoelectrons_that_they_stand_for(
     np.testing.assert_allclose(other.theta, one.theta, rtol=1e-6)
     np.testing.assert_allclose(same.level, light.level, rtol=1e-6)
     np.testing.assert_allclose(same.power, light.power, rtol=1e-6)
-    first = first_background(converted, follow_power=True)
-    np.testing.assert_allclose(first_background(stored, follow_power=True).level, first.level, 1e-6)
+    first = first_background(converted, LEARNT)
+    np.testing.assert_allclose(first_background(stored, LEARNT).level, first.level, 1e-6)
     left, over = (f.residual(ground, rows, 3, 9) for f in (converted, stored))
     np.testing.assert_allclose(over, left, atol=0.1)  # e, of noise 630
 
