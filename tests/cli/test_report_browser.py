@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import json
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -571,3 +573,16 @@ def test_ten_thousand_particles_are_shown_in_pages(browser: Any, tmp_path: Path)
     )
     assert "9999" in first_cells(browser, 0)
     assert not errors(browser)
+
+
+def test_the_answer_is_printed_on_two_sheets(browser: Any, pages: dict[str, Path]) -> None:
+    for name in ("landing", "mass", "track"):
+        show(browser, pages[name])
+        browser.execute_async_script(
+            "const done = arguments[0]; iscat.drawAll().then(() => done(1));"
+        )
+        printed = browser.execute_cdp_cmd(
+            "Page.printToPDF", {"paperWidth": 8.27, "paperHeight": 11.69}
+        )
+        content = base64.b64decode(printed["data"])
+        assert len(re.findall(rb"/Type\s*/Page[^s]", content)) == 2, name
