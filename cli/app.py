@@ -108,15 +108,12 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-def _iscat(
-    *,
-    show_version: Annotated[
-        bool,
-        typer.Option(
-            "--version", callback=_print_version, is_eager=True, help="Print the version."
-        ),
-    ] = False,
-) -> None:
+_VERSION: Any = typer.Option(
+    "--version", callback=_print_version, is_eager=True, help="Print the version."
+)
+
+
+def _iscat(*, show_version: Annotated[bool, _VERSION] = False) -> None:
     """Position and mass of single particles from interferometric scattering movies."""
 
 

@@ -429,17 +429,13 @@ class Interrupts:
         self._main = threading.get_ident()
         self._swallowed = False
         self.lost = False
-        self._thread = threading.Thread(target=self._watch, daemon=True, name="signals")
-
-    def begin(self) -> None:
-        """Begin to wait for signals, all of which are blocked."""
-        self._thread.start()
+        self.thread = threading.Thread(target=self._watch, daemon=True, name="signals")
 
     def stop(self) -> None:
         """Wait for signals no longer: the command has ended."""
         self._ended.set()
-        signal.pthread_kill(self._thread.ident or 0, signal.SIGUSR1)
-        self._thread.join()
+        signal.pthread_kill(self.thread.ident or 0, signal.SIGUSR1)
+        self.thread.join()
 
     def handle(self, _number: int, _frame: FrameType | None) -> None:
         """Raise the interrupt, in the main thread."""
@@ -468,7 +464,7 @@ class Interrupts:
         if number == signal.SIGUSR1:  # from `stop`
             return
         self._received = number
-        self._interrupt_main()
+        signal.pthread_kill(self._main, signal.SIGUSR1)
         if self._ends_in_time():
             signal.sigwait({signal.SIGUSR1})
             return
@@ -478,16 +474,13 @@ class Interrupts:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {last})
         signal.raise_signal(last)
 
-    def _interrupt_main(self) -> None:
-        signal.pthread_kill(self._main, signal.SIGUSR1)
-
     def _ends_in_time(self) -> bool:
         """Tell whether the command ends within the time that it has."""
         begun = time.monotonic()
         while not self._ended.wait(0.05):  # between two looks at what has become of an interrupt
             if self._swallowed:
                 self._swallowed = False
-                self._interrupt_main()
+                signal.pthread_kill(self._main, signal.SIGUSR1)
             passed = time.monotonic() - begun
             again = signal.sigpending() & self._numbers
             if passed > GRACE_S and (
@@ -520,7 +513,7 @@ def interrupts(messages: Messages) -> Iterator[Interrupts | None]:
         signal.signal(number, signal.SIG_DFL)
     signal.signal(signal.SIGUSR1, watched.handle)
     sys.unraisablehook = watched.note_unraisable
-    watched.begin()
+    watched.thread.start()
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGUSR1})
     try:
         yield watched

@@ -13,7 +13,7 @@ import re
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
@@ -387,11 +387,6 @@ def numbers(
     return parsed(option, text, lambda text: [kind(part) for part in text.split(",")], form)
 
 
-def whole(option: str, text: str | None) -> Any:
-    """Read ``1,2,4``."""
-    return numbers(option, text, "whole numbers as in {} 1,2,4", int)
-
-
 def pair(option: str, text: str | None) -> tuple[float, float | None] | None:
     """Read ``40:8`` or ``40``."""
 
@@ -411,7 +406,7 @@ def monomer(option: str, text: str | None) -> float | Literal["auto"] | None:
 _READERS: dict[str, Callable[[str, str | None], Any]] = {
     "masses_kda": numbers,
     "start_kda": numbers,
-    "steps": whole,
+    "steps": partial(numbers, form="whole numbers as in {} 1,2,4", kind=int),
     "ladder": monomer,
     "limit_kda": pair,
 }

@@ -63,14 +63,10 @@ PHOTONS = (100.0, 300.0, 1e3, 3e3, 1e4, 3e4)
 HEIGHTS = 9
 """Heights of the second curve, spread over ``fit.z_range_nm``."""
 
-FINE_HEIGHTS = 161
-"""Heights at which the bounds are drawn."""
 
 CURVE_SHARE = 4
 """A point of a curve has this many times fewer trials than the table."""
 
-POSTERIOR_SHARE = 20
-"""A posterior is sampled for one in this many trials."""
 
 PRIOR_XY_NM = 100.0
 PRIOR_Z_NM = 60.0
@@ -106,7 +102,8 @@ def run_benchmark(
         )
     threads = config.compute.workers if workers is None else workers
     fewer = max(trials // CURVE_SHARE, LEAST_TRIALS)
-    posteriors = max(trials // POSTERIOR_SHARE, MIN_TRIALS) if posterior else 0
+    # A posterior is sampled for one in this many trials
+    posteriors = max(trials // 20, MIN_TRIALS) if posterior else 0
     if estimators:
         refuse_sphere(config, "the estimators of others are of dipoles")
     modes = OF_SPHERES if config.particle.is_sphere else OF_DIPOLES
@@ -130,8 +127,15 @@ def run_benchmark(
         }
         histograms["ranks"][mode] = _rank_histograms(ranked)
         shorter = partial(run, count=fewer)
-        curves["photons"][mode] = _along_photons(config, setting, stream + 10, shorter)
-        curves["z"][mode] = _along_heights(config, setting, stream + 40, shorter)
+        make = partial(make_setting, config, mode, context=setting.context)
+        clear = float(make(collected=PHOTONS[0]).truth[2])  # a height far from the range's ends
+        lit = [make(collected=photons, z_nm=clear) for photons in PHOTONS]
+        curves["photons"][mode] = _curve(list(PHOTONS), lit, stream + 10, shorter)
+        heights = _heights(config)
+        curve = _curve(heights, [make(z_nm=z) for z in heights], stream + 40, shorter)
+        # the bounds are drawn between its points as well: fringes are narrower than its steps
+        fine = np.linspace(*_heights_of(config), 161).tolist()
+        curves["z"][mode] = curve | {"bounds": _bounds_along(fine, [make(z_nm=z) for z in fine])}
     if estimators:
         limited = partial(compare_estimators, time_limit_s=time_limit_s, progress=progress)
         others = limited(config, estimators, trials=trials, seed=seed)
@@ -177,8 +181,7 @@ def write_benchmark(study: Mapping[str, Any], folder: Path, *, overwrite: bool =
 
 def _pull(trials: Trials, k: int) -> FloatArray:
     kept = trials.usable
-    pull: FloatArray = (trials.estimate[kept, k] - trials.truth[kept, k]) / trials.sigma[kept, k]
-    return pull
+    return np.asarray((trials.estimate - trials.truth)[kept, k] / trials.sigma[kept, k])
 
 
 def _tally(progress: Progress, total: int) -> Callable[[int], None]:
@@ -233,7 +236,7 @@ def _scores(setting: Setting, found: Trials, ranked: PosteriorRanks) -> dict[str
             covered[f"posterior_coverage{level}"] = share(inside)
             covered[f"posterior_coverage{level}_ci95"] = share_interval(inside)
         covered["posterior_width_over_crb"] = float(np.mean(widths)) if widths.size else math.nan
-        out[name] = {**own.plain(), **covered, "baselines": baselines}
+        out[name] = {**vars(own), **covered, "baselines": baselines}
     return out | {
         "trials": len(found),
         "failed": int(found.failed.sum()),
@@ -260,22 +263,6 @@ Run = Callable[..., Trials]
 """`run_trials` for a setting and a stream, with the rest of a benchmark's choices."""
 
 
-def _along_photons(config: Config, setting: Setting, stream: int, run: Run) -> dict[str, Any]:
-    """Tabulate spread and bounds against the light, at a height far from the range's ends."""
-    make = partial(make_setting, config, setting.mode, context=setting.context)
-    clear = float(make(collected=PHOTONS[0]).truth[2])
-    settings = [make(collected=photons, z_nm=clear) for photons in PHOTONS]
-    return _curve(list(PHOTONS), settings, stream, run)
-
-
-def _along_heights(config: Config, setting: Setting, stream: int, run: Run) -> dict[str, Any]:
-    """Tabulate spread and bounds against the height; the bounds between its points as well."""
-    heights = _heights(config)
-    make = partial(make_setting, config, setting.mode, context=setting.context)
-    curve = _curve(heights, [make(z_nm=z) for z in heights], stream, run)
-    return curve | {"bounds": _bounds_along(config, setting)}
-
-
 def _curve(values: list[float], settings: list[Setting], stream: int, run: Run) -> dict[str, Any]:
     """Tabulate spread and bounds along an axis, for every free parameter."""
     found = [run(setting, stream=stream + number) for number, setting in enumerate(settings)]
@@ -300,16 +287,13 @@ def _curve(values: list[float], settings: list[Setting], stream: int, run: Run) 
     return out
 
 
-def _bounds_along(config: Config, setting: Setting) -> dict[str, Any]:
-    """Tabulate the bounds between the heights of the curve: fringes are narrower than its steps."""
-    heights = np.linspace(*_heights_of(config), FINE_HEIGHTS)
-    make = partial(make_setting, config, setting.mode, context=setting.context)
-    settings = [make(z_nm=float(z)) for z in heights]
+def _bounds_along(heights: list[float], settings: list[Setting]) -> dict[str, Any]:
+    """Tabulate the bounds of settings along the height."""
     lines = {
         name: {kind: [float(getattr(s, kind)[k]) for s in settings] for kind in ("crb", "qcrb")}
-        for name, k in setting.scored.items()
+        for name, k in settings[0].scored.items()
     }
-    return {"at": heights.tolist(), **lines}
+    return {"at": heights, **lines}
 
 
 def _heights_of(config: Config) -> tuple[float, float]:
@@ -335,9 +319,6 @@ def _prior(setting: Setting) -> tuple[FloatArray, FloatArray]:
     return np.where(free, lower, setting.truth), np.where(free, upper, setting.truth)
 
 
-RANGE_CRB = 5.0
-"""Half-width of the truths' range, in bounds, as long as the following are not exceeded."""
-
 RANGE_PX, RANGE_Z_NM, RANGE_MASS = 0.5, 10.0, 0.1
 """The same in pixels, nanometres, and relative to the mass."""
 
@@ -359,19 +340,10 @@ FALSE_ALARMS = 20
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Counts of one experiment, drawn once for all estimators.
-
-    Shapes: `truths` (n, 4).
-    """
+    """Counts of one experiment, drawn once for all estimators."""
 
     job: Job
-    truths: FloatArray
     limits: Limits
-
-    def scores(self, answer: Answer, seed: int) -> dict[str, dict[str, Any]]:
-        """Score an answer, parameter by parameter."""
-        weights = resamples(len(self.truths), seed)
-        return score_estimates(answer.columns, self.truths, self.limits, weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -401,7 +373,8 @@ def draw(
     area_um2 = (true.pixels * true.context.pixel_nm / 1000) ** 2
     others = replace(true, context=replace(true.context, model=true.context.wide))
     most = np.array([RANGE_PX * pixel, RANGE_PX * pixel, RANGE_Z_NM, RANGE_MASS * setting.truth[3]])
-    width = np.fmin(RANGE_CRB * true.bounds.crb_joint, most)  # where there is no bound, the most
+    # half-width of the truths' range, in bounds, as long as the following are not exceeded
+    width = np.fmin(5.0 * true.bounds.crb_joint, most)  # where there is no bound, the most
     width[[name not in setting.free for name in PARAMETERS]] = 0.0
     low, high = setting.config.fit.z_range_nm
     width[2] = min(width[2], setting.truth[2] - low, high - setting.truth[2]) * (width[2] > 0)
@@ -420,7 +393,7 @@ def draw(
         before.append(counts.before_e)
         after.append(counts.after_e)
     limits = limits_of_alike(true.experiment_in_region, true.free, truths, level=true.level)
-    return Draws(job_of(setting, np.stack(before), np.stack(after), starts), truths, limits)
+    return Draws(job_of(setting, np.stack(before), np.stack(after), starts), limits)
 
 
 def compare_estimators(
@@ -456,11 +429,11 @@ def compare_estimators(
     for k, (m, drawn) in enumerate(tables.items()):
         columns = {name: given[k].columns for name, given in answers.items()}
         scores = {name: entry[m] for name, entry in scored.items()}
-        weights = resamples(trials, seed)
-        pairs[m] = beside_best(columns, scores, drawn.truths, drawn.limits, weights)
+        pairs[m] = beside_best(columns, scores, drawn.limits, seed)
     for k, point in enumerate(points):
         given = {name: found[len(tables) + k] for name, found in answers.items()}
-        scores = {name: point.draws.scores(answer, seed) for name, answer in given.items()}
+        limits = point.draws.limits
+        scores = {who: score_estimates(one.columns, limits, seed) for who, one in given.items()}
         points[k] = replace(point, answers=given, scores=scores)
     nothing = {name: found[-1] for name, found in answers.items()}
     return {
@@ -473,9 +446,9 @@ def compare_estimators(
 
 
 def _scored(drawn: Draws, answer: Answer, seed: int) -> dict[str, Any]:
-    count = len(drawn.truths)
+    count = len(drawn.limits)
     return {
-        **drawn.scores(answer, seed),
+        **score_estimates(answer.columns, drawn.limits, seed),
         "trials": count,
         "failed": sum(answer.failures.values()),
         "failures": answer.failures,
@@ -543,7 +516,7 @@ def _map(points: Sequence[Point], seed: int) -> dict[str, Any]:
     shape = len(cells) // len(MAP_PHOTONS), len(MAP_PHOTONS)
     out: dict[str, Any] = {}
     for (row, column), cell in zip(np.ndindex(shape), cells, strict=True):
-        limits, count = cell.draws.limits, len(cell.draws.truths)
+        limits, count = cell.draws.limits, len(cell.draws.limits)
         for i, name in enumerate(limits.free):
             empty = {key: [[None] * shape[1] for _ in range(shape[0])] for key in _CELL}
             table = out.setdefault(name, empty)
@@ -556,7 +529,7 @@ def _map(points: Sequence[Point], seed: int) -> dict[str, Any]:
             if not kept:
                 continue
             best = max(kept, key=lambda who: kept[who])
-            truth = cell.draws.truths[:, PARAMETERS.index(name)]
+            truth = limits.truths[:, PARAMETERS.index(name)]
             errors = {who: cell.answers[who].columns[name] - truth for who in kept}
             against = partial(paired, theirs=errors[best], crb=limits.crb[:, i])
             weights = resamples(count, seed)
@@ -596,7 +569,7 @@ def _curves(points: Sequence[Point]) -> dict[str, Any]:
             qcrb, holevo = float(limits.qcrb[0, i]), float(limits.holevo[0, i])
             _append(curve["bounds"], name, {"crb": crb, "qcrb": qcrb, "holevo": holevo})
             for who, scored in point.scores.items():
-                entry = {**nothing, "failed": len(point.draws.truths), **scored.get(name, {})}
+                entry = {**nothing, "failed": len(limits), **scored.get(name, {})}
                 line = {key: entry[key] for key in (*nothing, "failed")}
                 _append(curve["estimators"].setdefault(who, {}), name, line)
     return out

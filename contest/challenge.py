@@ -25,8 +25,8 @@ import tifffile
 from iscat_analysis.bounds import paper
 from iscat_analysis.config import Config, config_to_toml, parse_config, refuse_sphere
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.files import whole_file
-from iscat_analysis.reading import is_file, read_bytes, read_json, toml_of
+from iscat_analysis.files import sha256_of_files, whole_file
+from iscat_analysis.reading import is_file, read_json, toml_of
 from iscat_analysis.records import PARAMETERS, FloatArray, Progress, silent
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.study import Setting, make_setting, trial_generator, write_stack
@@ -39,8 +39,6 @@ KNOWN = frozenset({MANIFEST, TRUTH, "stacks", "movies", "config"})
 
 STEPS_PER_ELECTRON = 1024
 """Expected counts are rounded to this part of a photoelectron."""
-
-_LARGEST = 2_000_000_000
 
 
 @dataclass(frozen=True)
@@ -87,8 +85,7 @@ def make_challenge(
         described: dict[str, Any] = {}
         for number, part in enumerate(parts):
             progress("challenge", number, len(parts))
-            sections = [section for section in TOLD if getattr(part.told, section) is not None]
-            told = config_to_toml(part.told, comments=False, sections=sections)
+            told = config_to_toml(part.told, comments=False, sections=TOLD)
             (building / "config" / f"{part.name}.toml").write_text(told, encoding="utf-8")
             make = _write_stacks if part.kind == "stacks" else _write_movie
             made = make(part, building, [chosen, number])
@@ -110,7 +107,7 @@ def make_challenge(
             "name": name,
             "blind": blind,
             "made_by": f"iscat-analysis {version('iscat-analysis')}",
-            "files": {p.relative_to(building).as_posix(): _sha256(p) for p in files},
+            "files": {p.relative_to(building).as_posix(): sha256_of_files([p]) for p in files},
             "truth_sha256": hashlib.sha256(text).hexdigest(),
             "parts": described,
         }
@@ -143,7 +140,7 @@ def read_challenge(folder: Path, truth: Path | None = None) -> Challenge:
         path = folder / name
         if not is_file(path):
             raise DataError(f"{path}: is missing, and the manifest names it; copy the whole folder")
-        if _sha256(path) != expected:
+        if sha256_of_files([path]) != expected:
             raise DataError(
                 f"{path}: is not the file of the manifest (its SHA-256 differs); results of it "
                 "cannot be scored: get the challenge again"
@@ -155,7 +152,7 @@ def read_challenge(folder: Path, truth: Path | None = None) -> Challenge:
             f"{folder}: is blind and its truth is not here ({where.name}); whoever made it has it: "
             "give it as `truth`"
         )
-    if _sha256(where) != manifest["truth_sha256"]:
+    if sha256_of_files([where]) != manifest["truth_sha256"]:
         raise DataError(
             f"{where}: is not the truth of this challenge (its SHA-256 is not the manifest's)"
         )
@@ -164,7 +161,7 @@ def read_challenge(folder: Path, truth: Path | None = None) -> Challenge:
 
 def manifest_sha256(folder: Path) -> str:
     """Hash the manifest, by which a score says what it is of."""
-    return _sha256(folder / MANIFEST)
+    return sha256_of_files([folder / MANIFEST])
 
 
 def draw_stack(setting: Setting, truth: FloatArray, random: np.random.Generator) -> Any:
@@ -258,13 +255,6 @@ def _json(path: Path, what: str) -> dict[str, Any]:
     except (TypeError, ValueError):
         raise DataError(f"{path}: is damaged; get the challenge again") from None
     return found
-
-
-def _sha256(path: Path) -> str:
-    try:
-        return hashlib.sha256(read_bytes(path, _LARGEST)).hexdigest()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror})") from None
 
 
 VERSION = 1

@@ -19,9 +19,6 @@ from iscat_analysis.study import EstimatorSetup
 
 Table = dict[str, FloatArray]
 
-TRACKPY_PX = 9
-"""Diameter of trackpy's mask, odd [pixels]."""
-
 
 def _picasso(before: FloatArray, after: FloatArray, setup: EstimatorSetup, *, mle: bool) -> Table:
     """Show Picasso bright spots: what is darker than the background is turned to be brighter."""
@@ -96,7 +93,9 @@ def trackpy(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Tab
     for i, image in enumerate(images):
         scaled = np.maximum(image - np.median(image), 0.0)
         features = tp.locate(
-            np.rint(60000 * scaled / (scaled.max() or 1.0)).astype(np.uint16), TRACKPY_PX
+            # diameter of trackpy's mask, odd [pixels]
+            np.rint(60000 * scaled / (scaled.max() or 1.0)).astype(np.uint16),
+            9,
         )
         if not len(features):
             continue

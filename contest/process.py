@@ -24,9 +24,6 @@ from iscat_analysis.records import FloatArray, Progress
 from iscat_analysis.study import EstimatorSetup, Setting, setup_of
 from iscat_contest.estimators import Estimate, Estimator, checked_table
 
-_MEGABYTE = 2.0**20
-_TOLD = 200  # characters of what a process said last
-
 
 @dataclass(frozen=True, eq=False)
 class Job:
@@ -95,7 +92,8 @@ def run_estimator(
                     timeout=limit_s, check=False,
                 )  # fmt: skip
                 lines = said.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-                last = f": {lines[-1][-_TOLD:]}" if lines else ""
+                # characters of what a process said last
+                last = f": {lines[-1][-200:]}" if lines else ""
                 why = f"its process ended with status {ended.returncode}{last}"
             except subprocess.TimeoutExpired:
                 why = f"no answer within {limit_s:g} s"
@@ -179,7 +177,7 @@ def _peak_mb() -> float:
     except ImportError:
         return float("nan")
     kilobytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return float(kilobytes * (1 if sys.platform == "darwin" else 1024) / _MEGABYTE)
+    return float(kilobytes * (1 if sys.platform == "darwin" else 1024) / 2.0**20)
 
 
 def main(request: str, answers: str) -> int:

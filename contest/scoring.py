@@ -20,6 +20,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from iscat_analysis import study
 from iscat_analysis.bounds import paper
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
@@ -30,18 +31,7 @@ from iscat_analysis.reading import is_folder
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Progress, silent
 from iscat_analysis.report import CHALLENGE_NAMES, atomic_folder, render_challenge
 from iscat_analysis.schemas import to_json
-from iscat_analysis.study import (
-    Limits,
-    beside_best,
-    limits_of_many,
-    make_setting,
-    matched,
-    mean_interval,
-    power_bound,
-    resamples,
-    score_estimates,
-    trial_generator,
-)
+from iscat_analysis.study import Limits, matched, resamples, score_estimates
 from iscat_contest.challenge import Challenge, manifest_sha256
 from iscat_contest.estimators import Estimator
 from iscat_contest.process import Answer, Job, job_of, run_estimators
@@ -59,9 +49,6 @@ SEED = 1
 
 WINDOW = 60
 """Frames before and after a landing that estimators are given of a movie, at most."""
-
-SHORTER = 10
-"""Percent of landings whose frames do not suffice for the window, about."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +70,6 @@ class _Group:
         """Whether each file holds one particle."""
         return bool(self.about["kind"] == "stacks")
 
-    @property
-    def truths(self) -> FloatArray:
-        """Parameters of the particles, shape (n, 4)."""
-        return np.asarray(self.events[list(PARAMETERS)], dtype=float)
-
 
 def score_challenge(
     challenge: Challenge,
@@ -102,7 +84,8 @@ def score_challenge(
     if len({path.name for path in results}) < len(results):
         raise DataError("two results have the same name, by which they are told apart; rename one")
     groups, manifest = _groups(challenge), challenge.manifest
-    hashes = {path.name: _sha256(path) for path in results}
+    files = {path: path / "fits.csv" if is_folder(path) else path for path in results}
+    hashes = {path.name: sha256_of_files([file]) for path, file in files.items()}
     cuts = [_job(challenge, group) for group in groups.values()] if estimators else []
     answers = run_estimators(estimators, [cut.job for cut in cuts], time_limit_s, progress)
     parts: dict[str, Any] = {}
@@ -116,14 +99,12 @@ def score_challenge(
                 entries[read.name], columns[read.name] = found
         for one in estimators:
             answer = cuts[number].whole(answers[one.name][number])
-            entry = _entry(answer.columns, group.truths, group.limits)
+            entry = _entry(answer.columns, group.limits)
             entries[one.name] = {**entry, "failures": answer.failures, "about": one.about}
             columns[one.name] = answer.columns
         about = {key: group.about[key] for key in ("kind", "mode", "about")}
-        parts[name] = about | _part(group.truths, group.limits, entries)
-        weights = resamples(len(group.truths), SEED)
-        paired = beside_best(columns, entries, group.truths, group.limits, weights)
-        parts[name]["paired"] = paired
+        parts[name] = about | _part(group.limits, entries)
+        parts[name]["paired"] = study.beside_best(columns, entries, group.limits, SEED)
     lost = [path.name for path in results if path.name not in used]
     if lost:
         raise DataError(
@@ -155,15 +136,15 @@ def _document(
     }
 
 
-def _part(truths: FloatArray, limits: Limits, entries: Mapping[str, Any]) -> dict[str, Any]:
+def _part(limits: Limits, entries: Mapping[str, Any]) -> dict[str, Any]:
     def rms(values: FloatArray) -> float:
         return float(np.sqrt(np.mean(values**2)))
 
     kinds = {"crb": limits.crb, "qcrb": limits.qcrb, "holevo": limits.holevo}
     return {
-        "trials": len(truths),
+        "trials": len(limits),
         "collected": float(np.mean(limits.collected)),
-        "mass_kda": float(truths[:, 3].mean()),
+        "mass_kda": float(limits.truths[:, 3].mean()),
         "bounds": {
             name: {kind: rms(values[:, i]) for kind, values in kinds.items()}
             for i, name in enumerate(limits.free)
@@ -251,7 +232,7 @@ def _groups(challenge: Challenge) -> dict[str, _Group]:
             changes["photons_per_pixel"] = config.simulation.photons_per_pixel
         config = config.model_copy(update={"bounds": config.bounds.model_copy(update=changes)})
         truths = events[list(PARAMETERS)].to_numpy(dtype=float)
-        limits = limits_of_many(config, FREE_PARAMETERS[about["mode"]], truths, frames)
+        limits = study.limits_of_many(config, FREE_PARAMETERS[about["mode"]], truths, frames)
         out[group] = _Group(about, challenge.told(parts[0]), events, limits)
     return out
 
@@ -287,16 +268,16 @@ def _of_results(
         columns["mass_kda"] = np.abs(columns["mass_kda"])  # one that leaves has a negative mass
     elif amplitude is not None:
         with np.errstate(divide="ignore", invalid="ignore"):
-            factor = float(np.nanmedian(group.truths[:, 3] / amplitude))
+            factor = float(np.nanmedian(group.limits.truths[:, 3] / amplitude))
         columns["mass_kda"] = factor * amplitude
         notes.append(f"masses are amplitudes × {factor:.6g}, the median of truth over amplitude")
-    return _entry(columns, group.truths, group.limits) | extra | {"notes": notes}, columns
+    return _entry(columns, group.limits) | extra | {"notes": notes}, columns
 
 
-def _entry(columns: Mapping[str, FloatArray], truths: FloatArray, limits: Limits) -> dict[str, Any]:
-    scored = score_estimates(columns, truths, limits, resamples(len(truths), SEED))
+def _entry(columns: Mapping[str, FloatArray], limits: Limits) -> dict[str, Any]:
+    scored = score_estimates(columns, limits, SEED)
     answered = max((one["answered"] for one in scored.values()), default=0)
-    return {**scored, "trials": len(truths), "failed": len(truths) - answered}
+    return {**scored, "trials": len(limits), "failed": len(limits) - answered}
 
 
 def _recall(placed: pd.DataFrame, rest: pd.DataFrame, group: _Group, movies: int) -> dict[str, Any]:
@@ -310,10 +291,11 @@ def _recall(placed: pd.DataFrame, rest: pd.DataFrame, group: _Group, movies: int
         rivals = np.sort(np.abs(rest[key].to_numpy(dtype=float)))[::-1]
         above &= np.abs(placed[key].to_numpy(dtype=float)) > rivals[allowed]
     table = []
-    for value in np.unique(group.truths[:, 3]):
-        kind = group.truths[:, 3] == value
-        share, interval = mean_interval(above[kind], resamples(int(kind.sum()), SEED))
-        best = [power_bound(s, rate) for s in group.limits.snr[kind]]
+    masses = group.limits.truths[:, 3]
+    for value in np.unique(masses):
+        kind = masses == value
+        share, interval = study.mean_interval(above[kind], resamples(int(kind.sum()), SEED))
+        best = [study.power_bound(s, rate) for s in group.limits.snr[kind]]
         counts = {"events": int(kind.sum()), "found": int(found[kind].sum())}
         recall = {"recall": share, "recall_ci95": interval, "matched_filter": float(np.mean(best))}
         table.append({"mass_kda": float(value), **counts, **recall})
@@ -354,14 +336,15 @@ def _job(challenge: Challenge, group: _Group) -> _Cut:
     else:  # frames that are there both before an event and with its particle
         end = events["leave"].fillna(about["frames"])
         room = np.minimum(events["frame"], end - events["frame"]).to_numpy(dtype=int)
-        n_before = n_after = max(1, min(WINDOW, int(np.percentile(room, SHORTER))))
+        # percent of landings whose frames do not suffice for the window, about
+        n_before = n_after = max(1, min(WINDOW, int(np.percentile(room, 10))))
     sums: FloatArray = np.full((2, len(events), side, side), np.nan)
     corners, starts = np.zeros((len(events), 2)), np.empty((len(events), 4))
-    truths = group.truths
+    truths = group.limits.truths
     for file, mine in events.groupby("file", sort=False):
         with open_stack(challenge.folder / str(file)) as stack:
             for i, first in mine["frame"].items():
-                random = trial_generator(SEED, 3000, int(i))
+                random = study.trial_generator(SEED, 3000, int(i))
                 place = np.rint(truths[i, 1::-1] / pixel + random.uniform(-1, 1, 2)).astype(int)
                 corner = np.clip(place - side // 2, 0, np.array(stack.shape[1:]) - side)
                 if room[i] < n_after:
@@ -379,20 +362,12 @@ def _job(challenge: Challenge, group: _Group) -> _Cut:
         sums[0] = photons if told.optics.interferes else told.background.level_e or 0.0
     changes = {"n_before": n_before, "n_after": n_after, "photons_per_pixel": photons}
     told = told.model_copy(update={"bounds": told.bounds.model_copy(update=changes)})
-    setting = make_setting(told, about["mode"])
+    setting = study.make_setting(told, about["mode"])
     starts[:, 2:] = told.particle.nominal_height_nm, setting.truth[3]
     setting = replace(setting, truth=np.array([*setting.truth[:2], *starts[0, 2:]]))
     whole = np.flatnonzero(np.isfinite(sums).all(axis=(0, 2, 3)))
     job = job_of(setting, sums[0, whole], sums[1, whole], starts[whole])
     return _Cut(job, corners[whole] * pixel, whole, len(events), n_after)
-
-
-def _sha256(path: Path) -> str:
-    source = path / "fits.csv" if is_folder(path) else path
-    try:
-        return hashlib.sha256(source.read_bytes()).hexdigest()
-    except OSError as error:
-        raise DataError(f"{source}: cannot be read ({error.strerror})") from None
 
 
 def score_own(truth: Path, results: Path, config: Config, *, command: str = "") -> dict[str, Any]:
@@ -411,10 +386,10 @@ def score_own(truth: Path, results: Path, config: Config, *, command: str = "") 
         refuse_other_units(found.name, placed, known.table, pixel)
     if not columns:
         raise DataError(f"{results}: has none of the columns {', '.join(free)}")
-    limits = limits_of_many(config, free, np.asarray(truths))
-    entries = {found.name: _entry(columns, truths, limits)}
+    limits = study.limits_of_many(config, free, np.asarray(truths))
+    entries = {found.name: _entry(columns, limits)}
     part = {"kind": "table", "mode": config.fit.mode, "about": ""}
-    part |= _part(truths, limits, entries)
+    part |= _part(limits, entries)
     hashes = {path.name: sha256_of_files([path]) for path in (truth, results)}
     title = "Estimates of one's own simulation"
     return _document(title, None, hashes, {"results": part}, command)

@@ -23,15 +23,10 @@ from iscat_analysis.study import EstimatorSetup
 REACH_PX = 3.0
 """A maximum is sought this far from the start [pixels]."""
 
-DOG_RATIO = 1.6
-"""Widths of the two Gaussians whose difference is nearest to a Laplacian (Marr & Hildreth 1980)."""
-
-CENTROID_PASSES = 10
 
 LOST = {Status.NOT_CONVERGED, Status.AT_BOUND, Status.AMBIGUOUS_Z}
 """Fits without an estimate that a user would keep."""
 
-_EVALUATIONS = 200
 
 Table = dict[str, FloatArray]
 Cut = tuple[slice, slice]
@@ -133,7 +128,7 @@ def _fitted(
             return np.asarray(np.stack(parts, axis=-1).reshape(-1, 5) * of(p)[1])
 
         begin = [0.8 * setup.polarity, *starts[i], setup.psf_sigma_nm / pixel, 0.0]
-        how: dict[str, Any] = {"method": "lm", "max_nfev": _EVALUATIONS}
+        how: dict[str, Any] = {"method": "lm", "max_nfev": 200}
         found = least_squares(lambda p: of(p)[0], begin, slopes, **how)
         if not found.success or not np.all(np.isfinite(found.x)):
             return np.full((2, 5), np.nan)
@@ -162,7 +157,6 @@ def matched_filter(before: FloatArray, after: FloatArray, setup: EstimatorSetup)
         setup.optics, setup.particle, setup.camera, pixels=side, z_nm=height,
         calibration=setup.calibration,
     )  # fmt: skip
-    template = template.reshape(template.shape[-2:])
     template = template - template.mean()
     turned = template[None, ::-1, ::-1] / np.sum(template**2)
     return _highest(fftconvolve(images, turned, mode="same", axes=(1, 2)), setup, 1)
@@ -175,7 +169,9 @@ def dog(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Table:
     """
     width = setup.psf_sigma_nm / setup.pixel_size_nm
     images = setup.image(before, after)
-    narrow, wide = (gaussian_filter(images, (0, s, s)) for s in (width, DOG_RATIO * width))
+    # widths of the two Gaussians whose difference is nearest to a Laplacian (Marr & Hildreth
+    # 1980)
+    narrow, wide = (gaussian_filter(images, (0, s, s)) for s in (width, 1.6 * width))
     return _highest(narrow - wide, setup, setup.polarity)
 
 
@@ -201,7 +197,7 @@ def centroid(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Ta
     out = np.full((len(images), 3), np.nan)
     for i, image in enumerate(images):
         column, row = setup.start[i, :2] / pixel
-        for _ in range(CENTROID_PASSES):
+        for _ in range(10):
             disc = np.hypot(x - column, y - row) <= reach
             mass = np.maximum(image[disc], 0.0)
             if not mass.sum() > 0:

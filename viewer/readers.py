@@ -42,13 +42,11 @@ class LazyFrames:
             wanted, rest = slice(None), [Ellipsis, *rest]
         numbers = np.arange(self.shape[0])[wanted]
         if np.ndim(numbers) == 0:
-            one: NDArray[Any] = np.asarray(self._frame(int(numbers)))[tuple(rest)]
-            return one
+            return np.asarray(np.asarray(self._frame(int(numbers)))[tuple(rest)])
         out = np.empty((len(numbers), *self.shape[1:]), dtype=self.dtype)
         for place, number in enumerate(numbers):
             out[place] = self._frame(int(number))
-        several: NDArray[Any] = out[(slice(None), *rest)]
-        return several
+        return np.asarray(out[(slice(None), *rest)])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.asarray(self[:], dtype=dtype)

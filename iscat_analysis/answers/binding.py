@@ -36,7 +36,6 @@ from iscat_analysis.species.equilibrium import (
     fit_equilibrium,
     landing_logits,
 )
-from iscat_analysis.species.events import Events
 from iscat_analysis.species.tables import EventTable, event_table, mass_in, refuse_far, sentences
 from iscat_analysis.text import from_table, in_table
 from iscat_analysis.units import count
@@ -50,7 +49,6 @@ CONCENTRATIONS: dict[Model, tuple[str, ...]] = {
 _OF_TABLES = ("complexes", "complexes_low", "complexes_high", "predicted", "pull", "background")
 _WRONG = 0.01  # p-value below which the model is doubted
 _FAR = 3.0  # standard errors of a table that is named
-_OTHER_MASS = 0.15  # of a mass that was given: farther away is another species
 _POINTS = 200  # of the curve
 
 
@@ -167,7 +165,10 @@ def fit_kd(
     name = "samples" if isinstance(samples, pd.DataFrame) else str(samples)
     rows, totals, found, findings = _series(samples, name, model, tables, options)
     masses, about = _masses(found, model, options["masses_kda"])
-    events = [_to_fit(table) for table in found]
+    events = [  # without a limit of detection, which is fitted then
+        table.events if table.edge_kda is None else replace(table.events, efficiency=None)
+        for table in found
+    ]
     how: Any = {"power": options["landing_power"], "inactive": options["inactive"]}
     fit = fit_equilibrium(events, totals, model=model, masses_kda=masses, **how)
     _refuse_undetected(name, fit)
@@ -385,11 +386,6 @@ def _result_of(movie: Path) -> Path | None:
     return folder if len({file.suffix.lower() for file in files}) == 1 else None
 
 
-def _to_fit(table: EventTable) -> Events:
-    """Select a table's events; without a limit of detection, it is fitted too."""
-    return replace(table.events, efficiency=None) if table.edge_kda is not None else table.events
-
-
 def _laid_out(
     rows: pd.DataFrame, tables: Sequence[EventTable], fit: EquilibriumFit
 ) -> pd.DataFrame:
@@ -418,7 +414,8 @@ def _doubts(
 ) -> Iterator[Finding]:
     """Doubt the constant."""
     for given, fitted in zip(masses_kda, fit.masses_kda.tolist(), strict=False):
-        if abs(fitted / given - 1) > _OTHER_MASS:
+        # of a mass that was given: farther away is another species
+        if abs(fitted / given - 1) > 0.15:
             yield said.OTHER_SPECIES({"given_kda": given, "found_kda": fitted})
     if fit.p_value < _WRONG:
         far = [t.name for t, pull in zip(tables, fit.pull, strict=True) if abs(pull) > _FAR]
@@ -434,12 +431,8 @@ def _doubts(
         yield said.SINGLE_TABLE()
 
 
-_POSSIBLE_PEAKS = (0.0, 11.5)  # ln of masses in kDa
 _PEAK_POINTS = 2000
 _SMOOTHING = 0.07  # of ln m: a third of what keeps peaks at m and 2 m apart
-_LEAST_PEAK = 0.05  # prominence of a peak, over the height of the highest
-_CLEAR_PEAK = 4.0  # the same in standard errors
-_NEAR_TWICE = 0.16  # of ln m: the lighter peak is shifted where much of it is missed
 
 
 def monomer_of(tables: Sequence[EventTable]) -> tuple[float, Finding]:
@@ -448,7 +441,8 @@ def monomer_of(tables: Sequence[EventTable]) -> tuple[float, Finding]:
     Every table counts alike.  Two peaks of the density of ln m, one at about twice the other, are
     monomers and dimers; of several such pairs the one with most events is taken.
     """
-    points = np.linspace(*_POSSIBLE_PEAKS, _PEAK_POINTS)
+    # ln of masses in kDa
+    points = np.linspace(0.0, 11.5, _PEAK_POINTS)
     step = points[1] - points[0]
     edges = np.append(points - step / 2, points[-1] + step / 2)
     logs = [np.log(np.abs(table.mass_kda)) for table in tables]
@@ -459,13 +453,15 @@ def monomer_of(tables: Sequence[EventTable]) -> tuple[float, Finding]:
     noise = np.sqrt(density * step / (2 * math.sqrt(math.pi) * _SMOOTHING) / events)
     found = find_peaks(density)[0]
     prominent = peak_prominences(density, found)[0]
-    clear = (prominent > _LEAST_PEAK * density.max()) & (prominent > _CLEAR_PEAK * noise[found])
+    # prominence of a peak over the height of the highest, and in standard errors
+    clear = (prominent > 0.05 * density.max()) & (prominent > 4.0 * noise[found])
     masses, heights = np.exp(points[found[clear]]), density[found[clear]]
     pairs = [
         (heights[one] + heights[two], one, two)
         for one in range(masses.size)
         for two in range(one + 1, masses.size)
-        if abs(math.log(masses[two] / (2 * masses[one]))) < _NEAR_TWICE
+        # of ln m: the lighter peak is shifted where much of it is missed
+        if abs(math.log(masses[two] / (2 * masses[one]))) < 0.16
     ]
     if not pairs:
         seen = ", ".join(f"{mass:.3g}" for mass in masses) or "none"

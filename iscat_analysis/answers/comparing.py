@@ -36,9 +36,6 @@ from iscat_analysis.units import count
 Table: TypeAlias = str | Path | pd.DataFrame | EventTable
 """What may be compared."""
 
-_MOST_WORKERS = 1024
-_MOST_POOLED = 20_000  # events that choose the species
-_DRAWN = 8  # samples in the figure's left panel
 _BINS = 120
 _REACH = 0.98  # quantile of the masses that is drawn
 _CHANCE = 0.05  # p-value that is called significant
@@ -131,7 +128,7 @@ def compare_tables(
     names = ("comparison.csv", "comparison.json", "figures")
     folder = folder_for(out, *names, overwrite=overwrite)
     if workers is not None:
-        workers = int(number_in("`workers`", workers, least=1, most=_MOST_WORKERS, whole=True))
+        workers = int(number_in("`workers`", workers, least=1, most=1024, whole=True))
     if not isinstance(tables, (list, tuple)) or len(tables) < 2:
         raise DataError("a comparison needs two tables of events, or more")
     read: list[EventTable] = []
@@ -186,7 +183,8 @@ def comparison_rows(contents: dict[str, Any]) -> pd.DataFrame:
 
 def _pooled(tables: Sequence[EventTable]) -> Events:
     """Events of all tables, thinned evenly where they are many."""
-    most = max(_MOST_POOLED // len(tables), LEAST_EVENTS)
+    # events that choose the species
+    most = max(20_000 // len(tables), LEAST_EVENTS)
     taken = [
         (np.abs(table.mass_kda[::step]), table.sigma_kda[::step])
         for table in tables
@@ -202,7 +200,8 @@ def _histograms(tables: Sequence[EventTable]) -> list[dict[str, Any]]:
     mass = np.concatenate([np.abs(table.mass_kda) for table in tables])
     edges = np.linspace(0, 1.2 * float(np.quantile(mass, _REACH)), _BINS + 1)
     drawn = []
-    for table in tables[:_DRAWN]:
+    # samples in the figure's left panel
+    for table in tables[:8]:
         counts: FloatArray = np.histogram(np.abs(table.mass_kda), edges)[0] / table.mass_kda.size
         drawn.append({"source": table.name, "edges": edges, "share": counts})
     return drawn

@@ -23,12 +23,8 @@ from iscat_analysis.records import BoolArray, FloatArray, is_event
 from iscat_analysis.species.describe import Branch, poisson_interval, round_width
 from iscat_analysis.species.tables import EventTable, event_table
 
-MOST_BARS = 2000
-"""Bars of a histogram at most."""
-
 _REACH = 0.99  # quantile of the masses up to which is drawn
 _POINTS = 400
-_MOST_USUAL = 240  # bars of a histogram whose width nobody chose
 
 
 @dataclass(frozen=True)
@@ -106,7 +102,8 @@ def usual_bin(table: pd.DataFrame) -> float:
         return 10.0
     spread = float(np.median(sigma)) if sigma.size else float(np.median(mass)) / 10
     wanted = 3.49 * spread * max(mass.size / 3, 1.0) ** (-1 / 3)
-    wanted = max(wanted, float(np.quantile(mass, _REACH)) / _MOST_USUAL, 1e-3)
+    # bars of a histogram whose width nobody chose
+    wanted = max(wanted, float(np.quantile(mass, _REACH)) / 240, 1e-3)
     return round_width(wanted)
 
 
@@ -124,7 +121,8 @@ def mass_histogram(
     )
     reach = 1.1 * float(np.quantile(mass, _REACH)) if mass.size else width
     bars = math.ceil(reach / width) + 1
-    if bars > MOST_BARS:
+    # bars of a histogram at most
+    if bars > 2000:
         raise ConfigError(
             f"`bin_kda` = {width:g} makes {bars} bars up to {reach:.4g} kDa: give a wider one"
         )

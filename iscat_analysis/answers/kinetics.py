@@ -48,13 +48,9 @@ from iscat_analysis.species.tables import EventTable, event_table
 IndexArray: TypeAlias = NDArray[np.int64]
 """Rows of a table."""
 
-LEAST_LANDINGS = 10
-"""Fewer landings have no rate that depends on time."""
 
 _LARGEST_RATE_TIME = 200.0  # of kT
 _GRID = 400  # rates among which the maximum is looked for
-_RATE_TOLERANCE = 1e-7  # of its logarithm
-_MASS_SIGMAS = 4.0  # standard errors between the masses of a pair
 
 
 @dataclass(frozen=True)
@@ -91,7 +87,8 @@ def landing_rate(times_s: FloatArray, seconds: float) -> LandingRate:
     Shapes: `times_s` (n,).
     """
     n = times_s.size
-    if n < LEAST_LANDINGS:
+    # fewer landings have no rate that depends on time
+    if n < 10:
         return LandingRate(n, seconds, *([math.nan] * 8))
     share = np.sort(times_s) / seconds
     mean = float(share.mean())
@@ -99,14 +96,10 @@ def landing_rate(times_s: FloatArray, seconds: float) -> LandingRate:
     def height(x: float) -> float:
         return -n * (math.log(exprel(-x)) + x * mean)
 
-    def rise(x: float) -> float:
-        return _middle(x) - mean
-
-    best = float(scipy.optimize.brentq(rise, -_LARGEST_RATE_TIME, _LARGEST_RATE_TIME, xtol=1e-10))
+    ends = -_LARGEST_RATE_TIME, _LARGEST_RATE_TIME
+    best = float(scipy.optimize.brentq(lambda x: _middle(x) - mean, *ends, xtol=1e-10))
     top = height(best)
-    ends = interval(
-        lambda x: 2 * (top - height(x)), best, -_LARGEST_RATE_TIME, _LARGEST_RATE_TIME, step=1.0
-    )
+    ends = interval(lambda x: 2 * (top - height(x)), best, *ends, step=1.0)
     flat = 2 * (top - height(0.0))
     # Information on ln λ₀ and x = kT: n, −n g', and that of ∫λ.
     slope = -_middle(best)
@@ -151,7 +144,8 @@ def pair_events(
     for leaving in leaves[np.argsort(frame[leaves], kind="stable")]:
         near = lands[tree.query_ball_point(place_px[leaving], radius_px)]
         error = np.hypot(sigma_kda[near], sigma_kda[leaving])
-        alike = np.abs(mass_kda[near] + mass_kda[leaving]) < _MASS_SIGMAS * error
+        # standard errors between the masses of a pair
+        alike = np.abs(mass_kda[near] + mass_kda[leaving]) < 4.0 * error
         fit = [int(i) for i in near[alike & (frame[near] < frame[leaving])] if int(i) not in taken]
         if fit:
             taken[max(fit, key=lambda i: frame[i])] = int(leaving)
@@ -187,7 +181,8 @@ def unbinding_rate(
         grid = np.linspace(low, high, _GRID)
         near = int(np.argmax([height(x) for x in grid]))
         around = float(grid[max(near - 1, 0)]), float(grid[min(near + 1, grid.size - 1)])
-        search = {"bounds": around, "method": "bounded", "options": {"xatol": _RATE_TOLERANCE}}
+        # of its logarithm
+        search = {"bounds": around, "method": "bounded", "options": {"xatol": 1e-7}}
         best = float(scipy.optimize.minimize_scalar(lambda x: -height(x), **search).x)
     top = height(best)
     ends = interval(lambda x: 2 * (top - height(x)), best, low, high, step=1.0)
@@ -202,12 +197,8 @@ def _middle(x: float) -> float:
     return 0.5 - x / 12 if abs(x) < 1e-3 else 1 / x - 1 / math.expm1(x)
 
 
-RADIUS_PX = 1.5
-"""Farthest that landing and leaving of one particle may lie apart [px]."""
-
 _WRONG = 0.01  # p-value of an exponential depletion
 _CHANCE = 0.1  # part of the pairs
-_SEARCHED = 0.95  # share of field and time below which it is said
 
 
 @dataclass(frozen=True)
@@ -260,7 +251,8 @@ def fit_kinetics(
     *,
     frame_rate_hz: float | None = None,
     frames: tuple[int, int] | None = None,
-    radius_px: float = RADIUS_PX,
+    # farthest that landing and leaving of one particle may lie apart [px]
+    radius_px: float = 1.5,
     calibration: Line | None = None,
 ) -> Kinetics:
     """Fit how fast particles land, how that is depleted, and how fast they leave.
@@ -347,7 +339,8 @@ def _doubts(
     table: EventTable, landing: LandingRate, unbinding: UnbindingRate | None
 ) -> Iterator[Finding]:
     """Doubt the rates."""
-    if (searched := _searched(table)) < _SEARCHED:
+    # share of field and time below which it is said
+    if (searched := _searched(table)) < 0.95:
         yield PARTLY_SEARCHED({"share": searched})
     if landing.p_value < _WRONG:
         yield NO_DEPLETION_LAW({"p_value": landing.p_value})

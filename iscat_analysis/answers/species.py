@@ -23,8 +23,6 @@ from iscat_analysis.species.tables import EventTable, event_table, mass_in, refu
 from iscat_analysis.units import count
 
 _EVENTS_EACH = 5  # of a species
-_MOST_SPECIES = 1000
-_MOST_DRAWS = 1_000_000
 
 
 @takes(SpeciesOptions)
@@ -84,7 +82,7 @@ def find_species(
     (66, (1, 2))
     """
     choice, branch = choice_of(options), options["branch"]
-    draws = int(number_in("`draws`", draws, least=0, most=_MOST_DRAWS, whole=True))
+    draws = int(number_in("`draws`", draws, least=0, most=1_000_000, whole=True))
     seed = int(number_in("`seed`", seed, least=0, whole=True))
     if kinetics is not None and not isinstance(kinetics, Kinetics):
         raise ConfigError(f"`kinetics` = {shown(kinetics)}: give what `fit_kinetics` returns")
@@ -151,24 +149,24 @@ def choice_of(options: SpeciesOptions) -> choices.Choice:
             f"`{named[0]}` and `{named[1]}` are two descriptions of the species; give one of them"
         )
     k, ladder, steps = options["k"], options["ladder"], options["steps"]
-    masses_kda, start_kda = options["masses_kda"], options["start_kda"]
-    offset, hold, background = options["offset"], options["hold"], options["background"]
-    for name, value in (("offset", offset), ("hold", hold), ("background", background)):
-        truth_in(f"`{name}`", value)
+    offset, hold, background = (
+        truth_in(f"`{name}`", options[name]) for name in ("offset", "hold", "background")
+    )
     widths = options["widths"]
     choice_in("`widths`", widths, ("common", "free"))
     choice_in("`branch`", options.get("branch", "magnitude"), ("magnitude", "landing", "leaving"))
-    for name, several in (("masses_kda", masses_kda), ("start_kda", start_kda), ("steps", steps)):
+    for name in ("masses_kda", "start_kda", "steps"):
+        several = options[name]
         if several is not None and not isinstance(several, (list, tuple, np.ndarray)):
             raise ConfigError(f"`{name}` = {shown(several)}: give a list, as in [66, 132]")
     if ladder is None and (len(steps) or offset or hold):
         which = "steps" if len(steps) else "offset" if offset else "hold"
         raise ConfigError(f"`{which}` is of a ladder; give `ladder` as well")
     if k is not None:
-        return choices.Number(int(number_in("`k`", k, least=1, most=_MOST_SPECIES, whole=True)))
-    if start_kda is not None:
+        return choices.Number(int(number_in("`k`", k, least=1, most=1000, whole=True)))
+    if (start_kda := options["start_kda"]) is not None:
         return choices.Begun(_masses("`start_kda`", start_kda))
-    if masses_kda is not None:
+    if (masses_kda := options["masses_kda"]) is not None:
         return choices.Given(_masses("`masses_kda`", masses_kda), widths, background)
     if ladder is None:
         return choices.Searched()

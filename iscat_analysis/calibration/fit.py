@@ -196,9 +196,6 @@ def peak_loss(
     return -float(np.sum(np.log(density / flat))), np.array(gradient)
 
 
-LEAST_PROBABILITY = 1e-4
-"""A line whose χ² is less probable than this does not fit its standards."""
-
 OFFSET_SHARE = 0.35
 """Largest contrast at zero mass, over the contrast of the lightest peak."""
 
@@ -252,7 +249,8 @@ def check_match(
     off = _misses(chosen, masses, abs(line.slope), offset)
     worst = int(np.argmax(np.abs(off)))
     start = f"{name}: the standards {_shown(masses)} do not match the peaks ({_found(peaks)}): "
-    if line.dof and float(chdtrc(line.dof, line.chi2)) < LEAST_PROBABILITY:
+    # A line whose χ² is less probable than this does not fit its standards
+    if line.dof and float(chdtrc(line.dof, line.chi2)) < 1e-4:
         raise DataError(
             f"{start}the nearest line misses {masses[worst]:g} kDa by "
             f"{100 * abs(off[worst]):.1f} %, with χ² = {line.chi2:.3g} for "

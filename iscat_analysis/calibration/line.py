@@ -52,10 +52,7 @@ def mass_from_contrast(
         raise ConfigError(f"gradient_per_kda = {gradient_per_kda:g} says nothing about mass")
     c = np.asarray(contrast, dtype=np.float64)
     direction = math.copysign(1.0, gradient_per_kda)
-    masses: FloatArray = (
-        np.sign(direction * c) * (direction * np.abs(c) - offset) / gradient_per_kda
-    )
-    return masses
+    return np.asarray(np.sign(direction * c) * (direction * np.abs(c) - offset) / gradient_per_kda)
 
 
 def line_sigma_kda(
@@ -190,7 +187,7 @@ class Standards:
     def to_dict(self) -> dict[str, Any]:
         """Give the entries of ``calibration.json``."""
         return {
-            "optics": _optics_keys(self.optics),
+            "optics": self.optics.model_dump(exclude={*_OF_A_MOVIE}, exclude_none=True),
             "covariance": None if self.covariance is None else self.covariance.model_dump(),
             "height_nm": self.height_nm,
             "camera": self.camera.model_dump(exclude_none=True),
@@ -253,11 +250,6 @@ def contrast_over(config: Config, standards: Standards) -> tuple[float, str]:
     )
     scale = forward_model(config.model_copy(update={"calibration": line}), reach_nm).scale
     return scale.carried, scale.refusal
-
-
-def _optics_keys(optics: Optics) -> dict[str, Any]:
-    values = optics.model_dump(exclude_none=True)
-    return {key: value for key, value in values.items() if key not in _OF_A_MOVIE}
 
 
 Line: TypeAlias = str | Path | Calibration | MassCalibration

@@ -27,14 +27,8 @@ from iscat_analysis.config.values import (
     length,
 )
 
-DIAMETERS_NM = (2.0, 2000.0)
-"""Range of diameters of the spheres that mode size may search."""
-
-FittedDiameter = Annotated[Positive, length(*DIAMETERS_NM)]
-
-
-TEMPERATURES_C = (-100.0, 250.0)
-"""Temperatures of liquids in a microscope; the upper end is below their values in kelvin."""
+# range of diameters of the spheres that mode size may search
+FittedDiameter = Annotated[Positive, length(2.0, 2000.0)]
 
 
 class BackgroundConfig(Section):
@@ -204,7 +198,8 @@ def _no_pascal_seconds(viscosity: float) -> float:
 
 
 def _no_kelvins(temperature: float) -> float:
-    low, high = TEMPERATURES_C
+    # temperatures of liquids in a microscope; the upper end is below their values in kelvin
+    low, high = -100.0, 250.0
     if not low <= temperature <= high:
         kelvin = f"; if that is in kelvin, write {temperature - 273.15:g}"
         raise ValueError(

@@ -28,7 +28,6 @@ from iscat_analysis.day.gather import MOVIE_COLUMNS, Found
 from iscat_analysis.day.jobs import Outcome, Runner, claim_folder, hash_of, write_whole
 from iscat_analysis.day.table import (
     Movie,
-    Plan,
     Standards,
     Table,
     configured,
@@ -196,7 +195,7 @@ def batch(
             if executor.distant:  # the longest first, so that none is left over at the end
                 queue = tuple(sorted(wanted, key=lambda movie: -_bytes_of(movie.row.path)))
             progress("movies", 0, len(wanted))
-            analysed = executor.each(lambda movie: _analyse(plan, day, movie, runner), queue)
+            analysed = executor.each(lambda movie: _analyse(day, movie, runner), queue)
             with closing(analysed):
                 for index, outcome in analysed:
                     name = queue[index].name
@@ -223,7 +222,7 @@ def batch(
     rows = [(name, each.state, each.why) for name, each in outcomes.items()]
     movies, nothing = pd.DataFrame(rows, columns=["movie", "state", "why"]), pd.DataFrame()
     part = Batch(folder, movies, nothing, nothing, ran, tuple(failed))
-    return part if only is not None else _gathered(part, plan, day, outcomes, reaction, runner)
+    return part if only is not None else _gathered(part, day, outcomes, reaction, runner)
 
 
 def checked_options(options: DayOptions) -> tuple[Reaction | None, Standards, Config]:
@@ -255,12 +254,12 @@ def _result(out: Path, movie: Movie) -> Path:
     return out / "movies" / f"{movie.name}.iscat"
 
 
-def _analyse(plan: Plan, day: Day, movie: Movie, runner: Runner) -> Outcome:
+def _analyse(day: Day, movie: Movie, runner: Runner) -> Outcome:
     """Analyse a movie with the calibrations of the day."""
     if movie.name in day.outcomes:  # a calibrant that could not be analysed without, either
         return day.outcomes[movie.name]
     try:
-        config = configured(plan.config, day.settings, movie.row)
+        config = configured(day.plan.config, day.settings, movie.row)
     except ConfigError as error:
         return Outcome("failed", f"{movie.row.path}: with the calibrations of the day: {error}")
     folder = _result(runner.out, movie)
@@ -269,14 +268,13 @@ def _analyse(plan: Plan, day: Day, movie: Movie, runner: Runner) -> Outcome:
 
 def _gathered(
     part: Batch,
-    plan: Plan,
     day: Day,
     outcomes: Mapping[str, Outcome],
     reaction: Reaction | None,
     runner: Runner,
 ) -> Batch:
     """Make tables and page of all results, unless they are up to date."""
-    out = part.out
+    out, plan = part.out, day.plan
     by_path = {movie.row.path: movie for movie in (*plan.flats, *plan.movies)}
     ordered = [by_path[row.path] for row in plan.table.rows]
     rows = [
@@ -296,7 +294,7 @@ def _gathered(
             for movie in ordered:
                 found.append(gather.read_movie(movie, outcomes[movie.name], _result(out, movie)))
                 runner.progress("gather", len(found), len(ordered))
-            publish_day(plan, day, found, reaction, part.failed, out)
+            publish_day(day, found, reaction, part.failed, out)
             runner.records.write("page", {"key": key})
     text = dict.fromkeys(("movie", "sample", "condition", "replicate"), str)
     movies, species = (_read(out / f"{name}.csv", text) for name in ("movies", "species"))
@@ -319,7 +317,6 @@ _FIGURE = re.compile(r"(overlaid|stacked(_\d+)?|species|shares|rates|kd(_\d+)?)\
 
 
 def publish_day(
-    plan: Plan,
     day: Day,
     found: Sequence[Found],
     reaction: Reaction | None,
@@ -327,7 +324,7 @@ def publish_day(
     out: Path,
 ) -> None:
     """Write the tables and the page of all movies; each file is written whole or not at all."""
-    movies = gather.movie_table(plan, day, found, out)
+    movies = gather.movie_table(day, found, out)
     species = compare.match_species(gather.species_table(found))[list(gather.SPECIES_COLUMNS)]
     shifted = compare.shifts(species[species["role"] != "calibrant"], reference_of(found))
     series = [] if reaction is None else compare.find_equilibria(found, reaction)
@@ -342,7 +339,8 @@ def publish_day(
         )
         write_whole(out / f"{name}.csv", text)
     with atomic_folder(out / "figures", True, known=_figure_files(out / "figures")) as folder:
-        page = _page(plan, day, found, tables, series, failed, folder)
+        contents = _contents(day, found, tables, series, failed)
+        page = batch_page(day.plan.table.title, summary_line(movies), contents, folder)
     write_whole(out / "batch.html", page)
     own = movies[list(movies.columns[len(MOVIE_COLUMNS) :])]
     with whole_file(out / "events.parquet") as partial:
@@ -355,16 +353,14 @@ def _figure_files(folder: Path) -> set[str]:
     return {name for name in held if _FIGURE.fullmatch(name)}
 
 
-def _page(
-    plan: Plan,
+def _contents(
     day: Day,
     found: Sequence[Found],
     tables: Mapping[str, pd.DataFrame],
     series: Sequence[compare.Series],
     failed: Sequence[tuple[str, str]],
-    folder: Path,
-) -> str:
-    """Make the page, and the figures in a folder."""
+) -> BatchContents:
+    """Gather what the page shows."""
     groups = {each.movie.name: _group(each) for each in found}
     movies, species = tables["movies"], tables["species"]
     timed = movies["seconds_searched"].notna() | movies["frames_searched"].isna()
@@ -374,7 +370,7 @@ def _page(
     counted = zip(movies["landings"].astype(float), exposure, strict=True)
     rates = [gather.poisson_rate(landings, time) for landings, time in counted]
     shown = movies.assign(
-        group=[groups[name] for name in movies["movie"]],
+        group=movies["movie"].map(groups),
         rate=[rate[0] for rate in rates],
         rate_from=[rate[1] for rate in rates],
         rate_to=[rate[2] for rate in rates],
@@ -382,10 +378,10 @@ def _page(
     )
     shown.attrs["further"] = list(movies.columns[len(MOVIE_COLUMNS) :])
     scales = {each.summary["mass_scale"] for each in found if each.summary}
-    contents = BatchContents(
+    return BatchContents(
         curves=[_curve(each, groups[each.movie.name]) for each in found],
         movies=shown,
-        species=species.assign(group=[groups[name] for name in species["movie"]]),
+        species=species.assign(group=species["movie"].map(groups)),
         shifts=tables["shifts"],
         equilibria=[
             (each.condition, each.binding.to_dict(), each.remarks)
@@ -399,7 +395,6 @@ def _page(
         ],
         mass_label="mass [kDa]" if scales <= {"calibration"} else "mass, model scale [kDa]",
     )
-    return batch_page(plan.table.title, summary_line(movies), contents, folder)
 
 
 def _calibrations(day: Day) -> list[tuple[str, str, str]]:

@@ -31,8 +31,9 @@ _OPTICS = (
 
 @dataclass(frozen=True)
 class Day:
-    """The calibrations of a batch."""
+    """A planned batch, and its calibrations."""
 
+    plan: Plan
     settings: Mapping[str, Any] = field(default_factory=dict)
     outcomes: Mapping[str, Outcome] = field(default_factory=dict)
     camera: str = "as configured"
@@ -81,7 +82,7 @@ def calibrate_day(plan: Plan, runner: Runner) -> Day:
             origins["mass"] = f"calibrants: {', '.join(tables)}"
         else:
             failed.append(("mass", outcome.why or "not made yet"))
-    return Day(settings, outcomes, failed=tuple(failed), standards_kda=standards, **origins)
+    return Day(plan, settings, outcomes, failed=tuple(failed), standards_kda=standards, **origins)
 
 
 def _camera(plan: Plan, runner: Runner) -> tuple[dict[str, Any], dict[str, Outcome]]:

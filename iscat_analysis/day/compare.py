@@ -33,9 +33,6 @@ from iscat_analysis.species.equilibrium import Model
 from iscat_analysis.species.maximum import TWO_SIDED_95
 from iscat_analysis.species.tables import event_table
 
-SAME_MASS = 0.1
-"""Relative distance of the masses up to which species of different movies are the same."""
-
 SHIFT_COLUMNS = (
     "kind", "kind_mass_kda", "sample", "condition", "reference", "quantity", "value", "se", "low",
     "high", "movies", "shift", "shift_se", "shift_low", "shift_high", "p_value", "p_holm",
@@ -46,13 +43,11 @@ difference from the reference sample with its interval, the chance of at least t
 there is none, alone and among all that are compared (Holm), and the scatter τ between replicates
 that the errors hold; NaN where there are no replicates."""
 
-_SIGMAS = 3.0  # standard errors within which two masses are the same
-
 
 def match_species(species: pd.DataFrame) -> pd.DataFrame:
     """Group species of one mass in different movies; a group is called a kind.
 
-    The two nearest groups are merged repeatedly, as long as they are within `SAME_MASS` or three
+    The two nearest groups are merged repeatedly, as long as they are within a tenth or three
     standard errors and have no movie in common.
     """
     real = species[~species["outlier"]].sort_values(["mass_kda", "movie"])
@@ -84,7 +79,8 @@ class _Group:
     se: float
 
     def joins(self, other: _Group) -> bool:
-        reach = max(SAME_MASS * self.mass, _SIGMAS * math.hypot(self.se, other.se))
+        # relative distance, or standard errors, within which two masses are the same
+        reach = max(0.1 * self.mass, 3.0 * math.hypot(self.se, other.se))
         return abs(other.mass - self.mass) <= reach and not self.movies & other.movies
 
     def with_(self, other: _Group) -> _Group:

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 from iscat_analysis.config import Config, configure, load_config
 from iscat_analysis.day.calibrate import Day
 from iscat_analysis.day.jobs import Outcome
-from iscat_analysis.day.table import Movie, Plan
+from iscat_analysis.day.table import Movie
 from iscat_analysis.records import FloatArray, Status
 from iscat_analysis.report.answer import answer_in
 from iscat_analysis.schemas.answers import DayMovie, DaySpecies
@@ -164,7 +164,7 @@ def shares_of(species: Sequence[Mapping[str, Any]]) -> list[dict[str, float]]:
     return shares
 
 
-def movie_table(plan: Plan, day: Day, found: Sequence[Found], out: Path) -> pd.DataFrame:
+def movie_table(day: Day, found: Sequence[Found], out: Path) -> pd.DataFrame:
     """Make the table of movies."""
     rows = []
     for each in found:
@@ -176,7 +176,7 @@ def movie_table(plan: Plan, day: Day, found: Sequence[Found], out: Path) -> pd.D
             **_numbers(each, day, out),
         }
         rows.append({**row, **{k: v for k, v in each.movie.row.further.items() if k not in row}})
-    further = [key for each in plan.table.rows for key in each.further]
+    further = [key for each in day.plan.table.rows for key in each.further]
     names = [*MOVIE_COLUMNS, *(n for n in dict.fromkeys(further) if n not in MOVIE_COLUMNS)]
     table = pd.DataFrame(rows, columns=names)
     for name in names[len(MOVIE_COLUMNS) :]:
@@ -259,23 +259,9 @@ def write_events(found: Sequence[Found], further: pd.DataFrame, path: Path) -> N
 SMALL_P = 0.01
 """A p-value below which a fit is counted as poor."""
 
-MOST_SMALL_P_SHARE = 0.1
-"""Share of small p-values, ten times the expected one, above which the model is doubted."""
-
-LARGEST_NOISE_RATIO = 1.5
-"""Noise over that of the photoelectrons, as a variance, that is told."""
-
-FAR_PX = 1.0
-"""Drift of the fixed pattern that is told [px]."""
 
 FEW_EVENTS = 10
 """Fewer events tell no species."""
-
-MOST_OUTSIDE_SHARE = 0.1
-"""Share of the masses beyond the standards that is told."""
-
-NEAR_STANDARD = 0.05
-"""Relative distance within which a species is a standard, where its interval is narrower."""
 
 
 def _quality(each: Found, day: Day) -> dict[str, Any]:
@@ -283,14 +269,17 @@ def _quality(each: Found, day: Day) -> dict[str, Any]:
     summary, masses_kda, p_values = each.summary, each.masses_kda, each.p_values
     cautions: list[str] = []
     noise, frames = each.noise
-    if noise is not None and noise > LARGEST_NOISE_RATIO:
+    # noise over that of the photoelectrons, as a variance, that is told
+    if noise is not None and noise > 1.5:
         cautions.append(f"noise {noise:.2g} times shot noise at {frames} frames")
     drift = each.background.get("drift_px")
     moved = float(np.hypot(*drift)) if drift and None not in drift else None
-    if moved is not None and moved > FAR_PX and not each.background.get("drift_corrected"):
+    # drift of the fixed pattern that is told [px]
+    if moved is not None and moved > 1.0 and not each.background.get("drift_corrected"):
         cautions.append(f"the pattern drifts {moved:.1f} px")
     small = float(np.mean(p_values < SMALL_P)) if p_values.size else None
-    if small is not None and small > MOST_SMALL_P_SHARE and p_values.size >= FEW_EVENTS:
+    # share of small p-values, ten times the expected one, above which the model is doubted
+    if small is not None and small > 0.1 and p_values.size >= FEW_EVENTS:
         cautions.append(f"{100 * small:.0f} % of p-values below {SMALL_P:g}")
     if summary.get("repeats", {}).get("understated"):
         cautions.append("σ is smaller than the measured spread")
@@ -305,7 +294,8 @@ def _quality(each: Found, day: Day) -> dict[str, Any]:
     if scale.startswith(("none", "another")):
         cautions.append(f"mass scale: {scale}")
     outside = _outside(masses_kda, day)
-    if outside is not None and outside > MOST_OUTSIDE_SHARE and masses_kda.size >= FEW_EVENTS:
+    # share of the masses beyond the standards that is told
+    if outside is not None and outside > 0.1 and masses_kda.size >= FEW_EVENTS:
         low, high = min(day.standards_kda), max(day.standards_kda)
         cautions.append(
             f"{100 * outside:.0f} % of masses are beyond the standards, {low:g} to {high:g} kDa"
@@ -375,7 +365,8 @@ def _standards_seen(each: Found, day: Day) -> tuple[int, int] | None:
     species = [s for s in each.distribution["species"] if not s["outlier"]]
     seen = sum(
         any(
-            abs(s["mass_kda"] - mass) <= max(NEAR_STANDARD * mass, 3 * (s["mass_se"] or 0.0))
+            # relative distance within which a species is a standard, or 3 standard errors
+            abs(s["mass_kda"] - mass) <= max(0.05 * mass, 3 * (s["mass_se"] or 0.0))
             for s in species
         )
         for mass in wanted

@@ -36,9 +36,6 @@ from iscat_analysis.threads import one_thread_algebra
 STATE = ".batch"
 """Folder of records and locks; it marks a folder as that of a batch."""
 
-_POLL_S = 0.2  # between two looks at a lock that another run holds
-_PATIENCE_S = 2.0  # after which the waiting is told
-_REMEMBERED = 2**14  # tables that were read
 _MAPS = ("gain_e_per_adu", "offset_adu", "read_noise_e", "response")
 
 
@@ -78,9 +75,11 @@ class Records:
         """Lock a job, so that no other run does it at the same time."""
         path = self._path(name).with_suffix(".lock")
         path.parent.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(path, thread_local=False, fallback_to_soft=False, poll_interval=_POLL_S)
+        # between two looks at a lock that another run holds
+        lock = FileLock(path, thread_local=False, fallback_to_soft=False, poll_interval=0.2)
         try:
-            held = take(lock, _PATIENCE_S)
+            # after which the waiting is told
+            held = take(lock, 2.0)
         except Timeout:
             tell([f"waiting for another run, which is at {name}"], notify)
             held = take(lock, -1)
@@ -176,7 +175,8 @@ def results_in(folder: Path) -> dict[str, str]:
     return found
 
 
-@lru_cache(maxsize=_REMEMBERED)
+# tables that were read
+@lru_cache(maxsize=2**14)
 def _reads(path: Path, size: int, changed_ns: int) -> str:
     """Tell whether a table can be read to its end, once until it changes."""
     del size, changed_ns

@@ -44,7 +44,6 @@ COLUMNS = ("path", "sample", "condition", "concentration_nm", "replicate", "role
 TABLES = ("samples.csv", "samples.toml")
 """The table of a folder that is watched."""
 
-_LEAST_LIKENESS = 0.85  # likeness of a column's name to one that has a meaning
 _LISTED_PROBLEMS = 5  # complaints in one line
 
 
@@ -246,7 +245,8 @@ def _names(source: Path, cells: list[str]) -> list[str]:
 def _check_names(source: Path, names: Sequence[str], where: str) -> None:
     """Refuse a table without paths, and a column whose name is a misspelled key."""
     for name in names:
-        near = difflib.get_close_matches(name.lower(), COLUMNS, n=1, cutoff=_LEAST_LIKENESS)
+        # likeness of a column's name to one that has a meaning
+        near = difflib.get_close_matches(name.lower(), COLUMNS, n=1, cutoff=0.85)
         if near and name not in COLUMNS and near[0] not in names:
             raise ConfigError(
                 f"{source}: {where} has the column {name}: did you mean {near[0]}? If not, give it "

@@ -47,10 +47,7 @@ from iscat_analysis.units import count
 RESTS = 3
 """Looks without a change after which a movie is complete."""
 
-GROWTH = 1.5
-"""Frames over those of the last analysis, from which it is worth another."""
 
-_FEWEST_FRAMES = 80  # of the first analysis
 _BINS = 24  # of the histogram
 _BARS = " ▁▂▃▄▅▆▇█"
 
@@ -135,7 +132,8 @@ class _Growing:
                 frames = movie.shape[0]
                 if frames < self._analysed:  # the recording was begun again
                     self._analysed = 0
-                if frames < max(_FEWEST_FRAMES, GROWTH * self._analysed):
+                # of the first analysis, and over those of the last from which another is worth it
+                if frames < max(80, 1.5 * self._analysed):
                     return
                 # as an array, because a file that grows has no hash
                 seen = Stack(movie.path, movie, files=(), metadata=movie.metadata)
@@ -168,7 +166,6 @@ MOST_CHECKS = 6
 FOLDER = "batch"
 """Of the results, in the folder that is watched."""
 
-_PAGES = 0.1  # share of the time that pages between two movies may take
 
 State = tuple[tuple[int, ...], ...]
 Ready = tuple[Table, tuple[State | None, ...]]
@@ -423,7 +420,8 @@ class _Run:
                 self._reported.add((name, why))
                 self._say(f"{name}: failed: {why}")
         ended = time.monotonic()
-        return found, ended + (ended - begun) / _PAGES
+        # share of the time that pages between two movies may take
+        return found, ended + (ended - begun) / 0.1
 
     def _batch(self, table: Table, **options: Any) -> Batch:
         roles = {row.role for row in table.rows}

@@ -43,7 +43,6 @@ from iscat_analysis.diagnosis.recognise import (
     Changes,
     as_landing,
     as_moving,
-    changes_summary,
     least_beside,
     look_at_changes,
 )

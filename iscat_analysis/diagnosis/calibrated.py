@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iscat_analysis import camera as cameras
 from iscat_analysis.config import Config
@@ -96,11 +95,6 @@ class Prepared:
         return self.known.camera
 
     @property
-    def response(self) -> cameras.Response | None:
-        """Response curve of the camera, where the counts show one."""
-        return self.known.response
-
-    @property
     def span(self) -> tuple[int, int]:
         """Frames that are fitted."""
         return fitted_frames(self.movie, self.config, self.config.background.recorded)
@@ -110,11 +104,6 @@ class Prepared:
         """Frames that tell of camera and light: the background's, where it has some."""
         start, stop = self.config.background.recorded or self.span
         return start, min(stop, self.movie.shape[0])
-
-    @property
-    def digest(self) -> Future[str]:
-        """Hash of the file."""
-        return self.movie.hashed()
 
     @property
     def flags(self) -> tuple[Status, ...]:
@@ -226,7 +215,11 @@ def counts(state: Prepared) -> tuple[Prepared, list[Finding | None]]:
     start, stop = _first_frames(state)
     seen = movie.read(start, stop)
     if not state.config.background.slides:  # windows that slide pass over frames that repeat
-        _refuse_still(seen, f"{name}: frames {start} to {stop - 1}")
+        still = all(np.array_equal(frame, seen[0]) for frame in seen[1:])
+        if len(seen) > 1 and still:  # without noise no error can be estimated
+            raise DataError(
+                f"{name}: frames {start} to {stop - 1} are all the same; export the movie again"
+            )
     cameras.refuse_overflow(state.stored.read(start, stop), name)
     findings = [axes_warning(name, seen)]
     if processing is None:
@@ -322,12 +315,3 @@ def _landing_light(state: Prepared, config: Config) -> tuple[JudgedLight, NoiseS
     if judged.steady is not movie:
         survey = start_in_thread(survey_light, judged.steady)
     return judged, *survey.result()
-
-
-def _refuse_still(frames: NDArray[Any], name: str) -> None:
-    """Refuse identical frames: without noise no error can be estimated.
-
-    Shapes: `frames` (t, y, x).
-    """
-    if len(frames) > 1 and all(np.array_equal(frame, frames[0]) for frame in frames[1:]):
-        raise DataError(f"{name} are all the same; export the movie again")

@@ -10,17 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.camera import (
-    LARGEST_PX,
-    Camera,
-    LightModel,
-    SteadyFrames,
-    find_light,
-    find_unsteady,
-    unsteady_finding,
-    whole_frames,
-    with_lines,
-)
+from iscat_analysis import camera as cameras
+from iscat_analysis.camera import Camera, LightModel, find_light, find_unsteady
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES
 from iscat_analysis.diagnosis.recognise import least_beside, spot_of
@@ -70,11 +61,11 @@ def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
         for part in (part for pair in pairs for part in (pair.before, pair.after)):
             part[:, odd] = dark
         movie = movie.without(odd, dark)
-        findings.append(unsteady_finding(odd, movie.name))
+        findings.append(cameras.unsteady_finding(odd, movie.name))
     lines = judge_lines(movie, config, camera, pairs, window)
     if lines is None:
         return JudgedLight(movie, None, tuple(findings), movie)
-    steady = movie.seen_as(SteadyFrames(movie, lines, camera))
+    steady = movie.seen_as(cameras.SteadyFrames(movie, lines, camera))
     return JudgedLight(movie, lines, (*findings, *lines.findings(movie.name)), steady)
 
 
@@ -91,14 +82,14 @@ def judge_lines(
     ):
         return None
     first, last = background.recorded or config.fit.frames or (0, movie.shape[0])
-    frames = whole_frames(movie.shape[1:], SPECTRUM_FRAMES)
+    frames = cameras.whole_frames(movie.shape[1:], SPECTRUM_FRAMES)
     counts = movie.read(first, max(first, min(last, movie.shape[0], first + frames)))
     counts = counts[good_frames(counts, camera)]
     if not len(counts):
         return None
     with one_thread_algebra():
         surface = find_light([(p.before, p.after) for p in pairs], camera, window)
-        return with_lines(counts, camera, surface)
+        return cameras.with_lines(counts, camera, surface)
 
 
 def _apart(pairs: Sequence[Pair]) -> list[NDArray[Any]]:
@@ -124,7 +115,7 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
     are compared one by one, half the movie apart: what they have in common is their background.
     """
     background, moving = config.background, config.background.way == "tracks"
-    total, large = movie.shape[0], math.prod(movie.shape[1:]) > LARGEST_PX
+    total, large = movie.shape[0], math.prod(movie.shape[1:]) > cameras.LARGEST_PX
     before = (0, 0) if moving or background.slides else background.recorded or (0, 0)
     first, last = config.fit.frames or (before[1], total)
     spans = [(before[0], min(before[1], total)), (first, min(last, total))]

@@ -15,23 +15,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from iscat_analysis.camera import (
-    SIGMAS,
-    TOLERANCE,
-    Camera,
-    FieldSample,
-    GainDiagnosis,
-    Law,
-    LearnedCamera,
-    LightZero,
-    NoiseSpectrum,
-    diagnose_gain,
-    find_zero,
-    measure_spectrum,
-    shared_light,
-    whole_frames,
-    without_pattern_jitter,
-)
+from iscat_analysis import camera as cameras
+from iscat_analysis.camera import Camera, GainDiagnosis, LightZero, NoiseSpectrum, measure_spectrum
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.findings import Finding, existing
@@ -62,20 +47,20 @@ _OTHERS = {
 }
 
 
-def zero_by_law(law: Law, level_e: float) -> LightZero | None:
+def zero_by_law(law: cameras.Law, level_e: float) -> LightZero | None:
     """Give the zero of the light that follows from the law of the counts."""
     if law.kind == "offset":
         return LightZero(law.value, law.se, law.value * level_e, law.flickers)
     return LightZero(0.0, law.se, 0.0, law.flickers) if law.kind == "linear" else None
 
 
-def law_finding(known: LearnedCamera, name: str) -> Finding | None:
+def law_finding(known: cameras.LearnedCamera, name: str) -> Finding | None:
     """Find counts that are not proportional to light, and which law they follow."""
     law = known.camera.law
     if law is None:
         return None
     share = {"percent": 100 * law.value, "percent_se": 100 * law.se}
-    if law.kind == "read noise" and law.value > TOLERANCE:
+    if law.kind == "read noise" and law.value > cameras.TOLERANCE:
         lacking = math.sqrt(law.value * known.level_e)
         return of.READ_NOISE_LACKING({**share, "lacking_e": lacking}, where=name)
     if not (law.bent or (law.kind == "other light" and law.dilutes)):
@@ -143,7 +128,7 @@ def offset_finding(zero: LightZero, camera: Camera) -> Finding:
     se, found = zero.se * counts / zero.share, offset + counts
     if np.ndim(camera.offset_adu):
         advice = "record a dark for `iscat calibrate camera --maps`"
-    elif found < -SIGMAS * se:  # no camera has its offset below no counts
+    elif found < -cameras.SIGMAS * se:  # no camera has its offset below no counts
         advice = "see whether counts were subtracted from the movie; record raw counts"
     else:
         advice = f"set camera.offset_adu = {max(found, 0.0):.4g}, or the mean of a dark"
@@ -192,7 +177,7 @@ def _judge_gain(
 
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """
-    gain = diagnose_gain(counts[:_GAIN_FRAMES], camera, masked=masked)
+    gain = cameras.diagnose_gain(counts[:_GAIN_FRAMES], camera, masked=masked)
     if spectrum is None or not spectrum.correlated:
         return gain
     ratio, error = spectrum.summed
@@ -271,9 +256,9 @@ def judge_counts(
     except DataError:  # too dark to tell
         return Noise(spectrum=spectrum)
     if follows and gain.shakes:
-        still = without_pattern_jitter(counts, camera, masked=masked)
+        still = cameras.without_pattern_jitter(counts, camera, masked=masked)
         return judge_counts(still, camera, masked=masked, additive=additive, whole=whole)
-    shared = shared_light(counts, camera, masked=masked)
+    shared = cameras.shared_light(counts, camera, masked=masked)
     if shared is not None:  # the spectrum is that of neighbours as well
         return Noise((of.FRAMES_FILTERED({"shared": shared}),), True)
     noisy = gain.off and gain.noise_ratio > 1
@@ -284,7 +269,7 @@ def judge_counts(
     if law is not None:
         zero = zero_by_law(law, float(camera.to_electrons(counts[:1]).mean()))
     elif not additive:
-        zero = find_zero(counts, camera, masked=masked)
+        zero = cameras.find_zero(counts, camera, masked=masked)
     leaks = spectrum is not None and spectrum.correlated
     if zero is not None and leaks and not zero.flickers:
         zero = None  # the variance of a pixel is then of its neighbours' light as well
@@ -379,14 +364,14 @@ class NoiseSurvey:
 def survey_noise(reader: Reader, config: Config) -> NoiseSurvey:
     """Judge the noise of a landing movie, and choose the window."""
     additive = not config.optics.interferes
-    judged, field = reader.sampled, FieldSample.of(reader.shape)
+    judged, field = reader.sampled, cameras.FieldSample.of(reader.shape)
     sample: dict[str, Any] | None = None
     with one_thread_algebra():
         opening, curve, window = judge_window(judged, config)
         whole = None
         if field is not None:
             sample = field.summary(opening[:_GAIN_FRAMES], judged.camera)
-            frames = whole_frames(reader.shape, SPECTRUM_FRAMES)
+            frames = cameras.whole_frames(reader.shape, SPECTRUM_FRAMES)
             counts = reader.read(reader.first, min(reader.first + frames, reader.last))
             whole = counts[good_frames(counts, reader.camera)], reader.camera
         follows = config.background.follows_pattern

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -223,8 +222,3 @@ def as_moving(changes: Changes, name: str) -> Finding | None:
 def _chance(number: int, share: float, most: float) -> float:
     """Chance that at least this share of the changes are such, if each is with chance `most`."""
     return float(bdtrc(round(number * share) - 1, number, most)) if number and share > 0 else 1.0
-
-
-def changes_summary(changes: Changes) -> dict[str, Any]:
-    """Summarise changes for ``summary.json``."""
-    return {"number": changes.number, "staying": changes.staying, "moving": changes.moving}

@@ -186,8 +186,7 @@ def _cells(movie: Stack, start: int, stop: int, *, each: bool = False) -> FloatA
     if placed is not None:
         placed.let_go()
     means = part.reshape(len(part), high, -1, wide, broad).mean(axis=(2, 4))
-    out: FloatArray = means if each else np.median(means, axis=0)
-    return out
+    return np.asarray(means if each else np.median(means, axis=0))
 
 
 def _runs(cells: FloatArray) -> list[tuple[int, int]]:

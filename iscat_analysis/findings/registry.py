@@ -187,11 +187,6 @@ class Findings:
         self.made.extend(existing(findings))
 
     @property
-    def warnings(self) -> list[str]:
-        """Sentences of all that are more than a note, in the same order."""
-        return warnings_in(self.made)
-
-    @property
     def summary(self) -> list[dict[str, Any]]:
         """``findings`` of ``summary.json``, the most severe first."""
         order = list(Severity)[::-1]

@@ -24,14 +24,8 @@ from iscat_analysis.config import (
     Particle,
 )
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference.checks import (
-    LARGEST,
-    array_of,
-    choice_in,
-    number_in,
-    real_array,
-    truth_in,
-)
+from iscat_analysis.inference import checks
+from iscat_analysis.inference.checks import number_in, real_array
 from iscat_analysis.inference.counts import KNOWN, MEAN, choose_noise, counts_likelihood, gaussian
 from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.likelihood import Likelihood
@@ -146,7 +140,7 @@ def config_of(
         raise ConfigError(
             f"camera.read_noise_e = {camera.read_noise_e!r} is a map: give one number [e]"
         )
-    choice_in("mode", mode, tuple(FREE_PARAMETERS))
+    checks.choice_in("mode", mode, tuple(FREE_PARAMETERS))
     fit = Fit(mode=mode, z_range_nm=z_range_nm)
     return Config(optics=optics, particle=particle, camera=camera, calibration=calibration, fit=fit)
 
@@ -157,7 +151,7 @@ def together(
     """Broadcast arrays against one another."""
     arrays = {name: real_array(name, value) for name, value in given.items()}
     for name, array in arrays.items():
-        most = LARGEST_NM if name.endswith("_nm") else LARGEST
+        most = LARGEST_NM if name.endswith("_nm") else checks.LARGEST
         bad = ~(np.abs(array) <= most)
         if name in least:
             bad |= array < least[name]
@@ -307,7 +301,7 @@ def gather(
         events = ratio[:, None, None] * background * (1 + events)
     level = (n_before > 0 or sigma is not None) and power_ratio is None and bool(model.rho)
     if options["level"] is not None:
-        level = truth_in("level", options["level"])
+        level = checks.truth_in("level", options["level"])
     grid = PixelGrid.region((0, rows), (0, columns), pixel_nm)
     return Counts(
         config, model, grid, background, events, ratio, level, n_before, n_after, out, burnt, spread
@@ -398,7 +392,7 @@ def _mask_of(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> Bool
     """Give a mask for every region, from one for each or one for all."""
     if value is None:
         return np.zeros(shape, dtype=np.bool_)
-    array = array_of(name, value)
+    array = checks.array_of(name, value)
     if array.dtype != np.bool_:
         raise DataError(f"{name}: holds {array.dtype}; give True where a pixel must not be used")
     if array.shape not in (shape, shape[1:]):

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
+from iscat_analysis import records
 from iscat_analysis.bounds import event_bounds
 from iscat_analysis.config import CameraConfig, Config, Optics, Particle, refuse_rod
 from iscat_analysis.errors import ConfigError, DataError
@@ -33,16 +34,11 @@ from iscat_analysis.pieces.counts import (
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     PARAMETERS,
-    Box,
     Candidate,
     ComplexArray,
     FitResult,
     FloatArray,
     Status,
-    flagged,
-    make_rows,
-    verdict,
-    with_diameters,
 )
 from iscat_analysis.search.templates import Templates, make_templates, signal_to_noise
 from iscat_analysis.threads import threads
@@ -173,11 +169,11 @@ def fit_rois(
     compile_kernels(counts.model, heights=config.fit.heights_free or has_prior(config))
     with threads(n_threads) as pool:
         rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
-    table = make_rows(rows, {"event": range(count)})
+    table = records.make_rows(rows, {"event": range(count)})
     if config.fit.kind.fits_sizes:
-        table = with_diameters(table, config.particle.density)
+        table = records.with_diameters(table, config.particle.density)
     refused = bool(counts.model.scale.refusal)
-    return flagged(table, Status.UNCALIBRATED_OPTICS) if refused else table
+    return records.flagged(table, Status.UNCALIBRATED_OPTICS) if refused else table
 
 
 def _round_particles(what: str, options: Any, *setup: Any) -> Config:
@@ -247,7 +243,7 @@ def line_of(
 
 
 def _status_of(flags: Iterable[Status]) -> dict[str, str]:
-    status, noticed = verdict(flags)
+    status, noticed = records.verdict(flags)
     return {"status": str(status), "flags": ";".join(str(flag) for flag in noticed)}
 
 
@@ -597,7 +593,7 @@ def log_likelihood(
     likelihood = counts.likelihood(0)
     fixed = np.array([0.0, 0.0, particle.nominal_height_nm, amplitude, 0.0])
     alone = np.array([False] * LEVEL + [counts.level])
-    around = Box(alone, fixed - alone * LARGEST_LEVEL, fixed + alone * LARGEST_LEVEL)
+    around = records.Box(alone, fixed - alone * LARGEST_LEVEL, fixed + alone * LARGEST_LEVEL)
     nothing = without_particle(likelihood, fixed, around)
     return LogLikelihood(
         names=names,

@@ -169,7 +169,9 @@ def find_directions(
     aside = likelihood.model.optics.polarization_deg + 20.0
     box = np.array([reach, reach, 0.0, math.inf, math.inf, math.inf, 1.0])
     found = []
-    for azimuth, tilt in _everywhere():
+    # all over the half sphere; lying rods have half of the azimuths
+    steps = [(tilt, (360.0 if tilt < 90 else 180.0) / count, count) for tilt, count in _RINGS]
+    for azimuth, tilt in [(k * step, tilt) for tilt, step, count in steps for k in range(count)]:
         start = _start(likelihood, z_nm, rods, aside + azimuth, tilt)
         lower, upper = start - box, start + box
         lower[AMPLITUDE], upper[AMPLITUDE] = 0.0, largest
@@ -198,15 +200,6 @@ def axis_of(theta: FloatArray) -> FloatArray:
     azimuth, tilt = np.radians(theta[[AZIMUTH, TILT]])
     flat = math.sin(tilt)
     return np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.cos(tilt)])
-
-
-def _everywhere() -> list[tuple[float, float]]:
-    """Azimuths and tilts all over the half sphere; lying rods have half of the azimuths."""
-    return [
-        (k * (360.0 if tilt < 90 else 180.0) / count, tilt)
-        for tilt, count in _RINGS
-        for k in range(count)
-    ]
 
 
 def _start(

@@ -11,24 +11,16 @@ of its errors depend on all of them (`rows`).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from iscat_analysis import diagnosis
 from iscat_analysis.calibration import with_standards
 from iscat_analysis.camera import text_summary
 from iscat_analysis.config import Config, refuse_rod
-from iscat_analysis.diagnosis import (
-    LIGHT_STEPS,
-    Prepared,
-    Step,
-    as_landing,
-    as_moving,
-    calibrated,
-    changes_summary,
-    look_at_changes,
-)
+from iscat_analysis.diagnosis import LIGHT_STEPS, Prepared, Step
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.executors import Executor
 from iscat_analysis.findings import Finding, existing
@@ -163,7 +155,9 @@ def analyse(movie: Stack, config: Config, run: Run | None = None, *, command: st
 
 def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     """Load and calibrate a movie."""
-    ready = calibrated(movie, config, STEPS, report=run.report, notify=run.notify, ahead=True)
+    ready = diagnosis.calibrated(
+        movie, config, STEPS, report=run.report, notify=run.notify, ahead=True
+    )
     run.clock.lap("optics")
     text = ready.known.text
     left_out = {"texts": [] if text is None else text_summary(text)}
@@ -197,7 +191,7 @@ def optics(state: Prepared) -> tuple[Prepared, list[Finding]]:
         )  # fmt: skip
     changes, stretches, breaks = state.changes, state.stretches, None
     if changes is not None and config.optics.na != configured.optics.na:
-        changes = start_in_thread(look_at_changes, steady, config, camera, state.span)
+        changes = start_in_thread(diagnosis.look_at_changes, steady, config, camera, state.span)
     if config.background.slides and config.optics.focus_jumps:
         jumps = [frame for frame, rise in config.optics.focus_jumps if rise]
         stretches = stretches.with_jumps(jumps)
@@ -213,10 +207,10 @@ def kind(state: Prepared) -> tuple[Prepared, list[Finding]]:
     if state.changes is None:
         return state, []
     changes = state.changes.result()
-    other = (as_landing if state.config.fit.follows_tracks else as_moving)(
+    other = (diagnosis.as_landing if state.config.fit.follows_tracks else diagnosis.as_moving)(
         changes, state.movie.name
     )
-    summary = {**state.summary, "changes": changes_summary(changes)}
+    summary = {**state.summary, "changes": asdict(changes)}
     said = "" if other is None else other.text
     return replace(state, other_kind=said, summary=summary), existing([other])
 

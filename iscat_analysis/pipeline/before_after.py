@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis import diagnosis
+from iscat_analysis import diagnosis, records
 from iscat_analysis.camera import measure_windows, refine_power, start_power
 from iscat_analysis.config import BackgroundConfig
 from iscat_analysis.diagnosis import Noise, Prepared
@@ -48,18 +48,7 @@ from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.landing.split_frames import field_repeats
 from iscat_analysis.movie import Stack
 from iscat_analysis.pipeline.kinds import Kind, Look, candidate_table, with_threshold
-from iscat_analysis.records import (
-    FREE_PARAMETERS,
-    Candidate,
-    EventView,
-    FloatArray,
-    PosteriorResult,
-    Progress,
-    Status,
-    Windows,
-    is_event,
-    verdict,
-)
+from iscat_analysis.records import FREE_PARAMETERS, FloatArray, PosteriorResult, Windows
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
 
@@ -301,7 +290,7 @@ class StoredEvents:
     def _open(self, span: tuple[int, int]) -> tuple[Windows, list[int]]:
         """Give the sums, with the light that the particles leave, and the rows in them."""
         windows, table, context = self.sums(span), self.table, self.context
-        rows = table.index[table["mass_kda"].notna() & is_event(table)]
+        rows = table.index[table["mass_kda"].notna() & records.is_event(table)]
         frames, still = table["frame"], self._still
         here = [int(i) for i in rows if still or int(frames.iloc[i]) == span[0]]
         if self.ready.config.background.power_normalization:
@@ -311,14 +300,16 @@ class StoredEvents:
             windows = refine_power(windows, signal, additive=context.additive)
         return windows, here
 
-    def __call__(self, row: int) -> EventView:
+    def __call__(self, row: int) -> records.EventView:
         """Draw a row of the table."""
         table, context = self.table, self.context
         frame = int(table["frame"].iloc[row])
         windows, here = self._opened(self.after if self._still else (frame, frame + 1))
         x_nm, y_nm, z_nm, mass = _place(table.iloc[row])
         pixel = context.pixel_nm
-        start = Candidate(x_nm / pixel, y_nm / pixel, z_nm, mass, float(table["snr"].iloc[row]))
+        start = records.Candidate(
+            x_nm / pixel, y_nm / pixel, z_nm, mass, float(table["snr"].iloc[row])
+        )
         region = region_around(context.roi_px, self.ready.shape, start)
         others = self._drawn(region, [i for i in here if i != row])
         if context.lines is not None:
@@ -373,12 +364,17 @@ def _flag_changing_masses(
         squares, degrees = own[0, column], own[0, -1]
         if degrees >= 4 and squares > CHANGES**2 * degrees:
             changing += 1
-            judged[number] = replace(event, flags=verdict([*event.flags, Status.POOR_FIT])[1])
+            judged[number] = replace(
+                event, flags=records.verdict([*event.flags, records.Status.POOR_FIT])[1]
+            )
     return tuple(judged), changing
 
 
 def _sample_posteriors(
-    context: AnalysisContext, events: Sequence[Event], pool: ThreadPoolExecutor, progress: Progress
+    context: AnalysisContext,
+    events: Sequence[Event],
+    pool: ThreadPoolExecutor,
+    progress: records.Progress,
 ) -> tuple[list[PosteriorResult], bool]:
     """Sample the posteriors, in order; an interrupt keeps those that are done."""
     stop = threading.Event()

@@ -18,14 +18,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis import diagnosis
+from iscat_analysis import diagnosis, records
 from iscat_analysis.bounds import holevo_over_quantum
 from iscat_analysis.calibration import as_given
 from iscat_analysis.camera import Camera, FieldSample, Pattern, middle_of, pattern_of
 from iscat_analysis.config import MODES, MOVES, Config, config_to_toml
 from iscat_analysis.diagnosis import Prepared, Stretches
 from iscat_analysis.executors import versions
-from iscat_analysis.findings import Finding
+from iscat_analysis.findings import Finding, warnings_in
 from iscat_analysis.findings.particles import SPREAD_NOT_MEASURED
 from iscat_analysis.findings.tables import SPHERES_MISSED, TRACKS_LEFT_OUT
 from iscat_analysis.fitting.context import AnalysisContext
@@ -38,20 +38,11 @@ from iscat_analysis.pipeline.kinds import Kind
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     Analysis,
-    Film,
     FloatArray,
-    Provenance,
     Status,
     TrackStatus,
     flagged,
-    free_parameters,
-    is_event,
-    is_rejected,
     make_rows,
-    silent,
-    species_rows,
-    tally,
-    with_diameters,
 )
 from iscat_analysis.report.numbers import number
 from iscat_analysis.search.frames import DARK, measure_frames, well_lit
@@ -196,7 +187,7 @@ def _events(table: pd.DataFrame, first: int, last: int) -> dict[str, Any]:
     edges = np.unique(np.linspace(first, last, 40 + 1).astype(int))
     frame = table["frame"].to_numpy(float)
     ok = (table["status"] == Status.OK.value).to_numpy()
-    others = ~ok & is_event(table)
+    others = ~ok & records.is_event(table)
     return {
         "edges": edges.tolist(),
         "ok": np.histogram(frame[ok], edges)[0].tolist(),
@@ -226,9 +217,9 @@ def summary_of(
     achieved: Mapping[str, EmpiricalSpread],
 ) -> dict[str, Any]:
     """Gather counts, medians and efficiency, for ``summary.json``; `species_of` has the rest."""
-    rows = tally(table)
+    rows = records.tally(table)
     good = table[table["status"] == Status.OK]
-    free = free_parameters(context.mode, table)
+    free = records.free_parameters(context.mode, table)
     conflict = {"z_nm", "mass_kda"} <= set(free) and len(good) > 0
     cost = _holevo_over_quantum(context, good["z_nm"].to_numpy(float)) if conflict else {}
     precision = {}
@@ -305,7 +296,7 @@ def species_of(
             "across_particles": [],
             "sizes": None if found is None else found.to_dict(),
         }
-    used, notes = species_rows(table)
+    used, notes = records.species_rows(table)
     distribution = _distribution(context, used, searched or 1.0)
     if distribution is not None:
         distribution["notes"].extend(notes)
@@ -481,7 +472,7 @@ def reported_rows(
         kinds = table.columns.intersection(["repeat_mass_kda", "systematic_mass_kda"])
         table[kinds] = table[kinds].where(table["mass_kda"].notna(), np.nan, axis=0)
     if config.fits_sizes:
-        table = with_diameters(table, config.particle.density)
+        table = records.with_diameters(table, config.particle.density)
     budget: list[dict[str, Any]] = []
     if "mass_kda" in FREE_PARAMETERS[mode]:
         unknown = None if config.calibration else systematic.SCALE
@@ -523,7 +514,7 @@ def make_analysis(
     """Put everything that is reported of a movie into an `Analysis`."""
     if found.interrupted:  # what was finished is now gathered and kept, which takes a moment
         run.progress("report", 0, 1)
-        run = replace(run, progress=silent)  # another stage would end the time to write
+        run = replace(run, progress=records.silent)  # another stage would end the time to write
     context, compared = found.context, found.compared
     config = context.config
     further = {**ready.summary, **({kind.heading: found.summary} if found.summary else {})}
@@ -562,10 +553,10 @@ def make_analysis(
     run.report(systematic.wide_species(described["across_particles"], calibrated=calibrated))
     timeline = timeline_future.result()
     summary = summary_of(context, table, compared, run.clock.seconds, seen.achieved)
-    provenance = Provenance(
+    provenance = records.Provenance(
         command=printable(command) or "iscat_analysis.pipeline.analyse",
         input_path=printable(str(ready.whole.path)),
-        input_sha256=ready.digest.result(),
+        input_sha256=ready.movie.hashed().result(),
         versions=versions(),
         seed=config.compute.seed if config.samples_posterior else None,
         started=started,
@@ -583,7 +574,7 @@ def make_analysis(
         "versions": dict(provenance.versions),
         "interrupted": found.interrupted,
         "findings": run.findings.summary,
-        "warnings": run.findings.warnings,
+        "warnings": warnings_in(run.findings.made),
         **described,
     }
     spans = compared.frames_before, compared.frames_after
@@ -604,7 +595,7 @@ def make_analysis(
         findings=tuple(run.findings.made),
         tracks=tracks,
         films=films,
-        response=ready.response.table if ready.response is not None else None,
+        response=ready.known.response.table if ready.known.response is not None else None,
     )
 
 
@@ -619,7 +610,7 @@ def _judge_spread(
         {name: one for name, one in seen.achieved.items() if name not in had},
         found.summary,
         scaled=config.fit.sigma == "measured",
-        rejected=is_rejected(table),
+        rejected=records.is_rejected(table),
         sliding=config.background.slides,
     )
 
@@ -630,7 +621,7 @@ def _tracks(
     found: DetectionResult,
     table: pd.DataFrame,
     ticks: NDArray[Any] | None,
-) -> tuple[pd.DataFrame | None, tuple[Film, ...], Mapping[str, Any]]:
+) -> tuple[pd.DataFrame | None, tuple[records.Film, ...], Mapping[str, Any]]:
     """Describe particles that were followed, draw films of some, and summarise them."""
     context, followed = found.context, found.followed
     if followed is None:

@@ -20,6 +20,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from iscat_analysis import records
 from iscat_analysis._kernels.sliding import contrast_map
 from iscat_analysis.bounds import power_searched
 from iscat_analysis.camera import LARGEST_PX, Camera, CutFrames, LightModel, Mover, Trajectory
@@ -41,29 +42,12 @@ from iscat_analysis.movie import ChangedFrames
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.finish import reported_rows
 from iscat_analysis.pipeline.kinds import Kind, Look, candidate_table
-from iscat_analysis.records import (
-    FRAME_COLUMN,
-    Candidate,
-    CountSource,
-    EventView,
-    FloatArray,
-    Status,
-    counted,
-    is_event,
-)
+from iscat_analysis.records import FloatArray, Status
+from iscat_analysis.search import sliding
 from iscat_analysis.search.chunks import HALO, Reader, halo_px, reader_of
 from iscat_analysis.search.dating import StepFrame
 from iscat_analysis.search.frames import Tile
-from iscat_analysis.search.sliding import (
-    STRIDES,
-    Filter,
-    MapArray,
-    boundaries,
-    find_steps,
-    make_filter,
-    sliding_maps,
-    stride_of,
-)
+from iscat_analysis.search.sliding import STRIDES, stride_of
 from iscat_analysis.search.templates import LARGEST_IMAGE
 from iscat_analysis.threads import threads
 
@@ -152,7 +136,7 @@ def inject_and_recover(ready: Prepared, run: Run, result: DetectionResult) -> di
     )
     if again.interrupted:
         raise KeyboardInterrupt
-    rows = counted(reported_rows(again)[0])
+    rows = records.counted(reported_rows(again)[0])
     searched = again.summary["searched_share"] or 1.0
     return _recovery(particles, rows, result.context, frames[1], window, searched)
 
@@ -206,7 +190,7 @@ def _recovery(
     steps += [(p.leave, -1, p) for p in particles if p.leave < last]
     frame, x, y, mass, error = (
         found[name].to_numpy(dtype=float)
-        for name in ("frame", "x_px", "y_px", "mass_kda", FRAME_COLUMN)
+        for name in ("frame", "x_px", "y_px", "mass_kda", records.FRAME_COLUMN)
     )
     rows: list[tuple[int, bool, int, Any]] = []
     for when, side, p in steps:
@@ -277,7 +261,9 @@ class LandingSearch:
         # lengths of window whose models are remembered
         @lru_cache(16)
         def context(window: int) -> AnalysisContext:
-            searches = sum(boundaries(stop - start, window) for start, stop in self._stretches)
+            searches = sum(
+                sliding.boundaries(stop - start, window) for start, stop in self._stretches
+            )
             return make_context(
                 config, self._reader.shape, searches=searches, noise=noise.spectrum,
                 lines=ready.lines, sliding=True,
@@ -311,11 +297,13 @@ class LandingSearch:
             contrast = (1 + contrast) / (1 + known) - 1
 
         @cache
-        def map_of() -> tuple[Filter, MapArray, FloatArray]:
-            matched = make_filter(chunk, context.templates.images[0], context.templates.noise)
+        def map_of() -> tuple[sliding.Filter, sliding.MapArray, FloatArray]:
+            matched = sliding.make_filter(
+                chunk, context.templates.images[0], context.templates.noise
+            )
             count = chunk.edges.size - 2
             empty = np.zeros((count, *chunk.shape), np.float32), np.zeros(count)
-            snr, effective = sliding_maps(
+            snr, effective = sliding.sliding_maps(
                 chunk, matched, STRIDES, explained=None if known is None else lambda *_: known,
                 earlier=empty, changed=[at],
             )  # fmt: skip
@@ -323,7 +311,7 @@ class LandingSearch:
 
         def search(threshold: float) -> pd.DataFrame:
             matched, snr, effective = map_of()
-            peaks = find_steps(chunk, matched, snr, effective, threshold)
+            peaks = sliding.find_steps(chunk, matched, snr, effective, threshold)
             sieve = SidelobeFilter(chunk.first, stride, window, context.roi_px)
             sign, scale = reported_steps(context), context.model.scale
             return candidate_table(
@@ -350,13 +338,13 @@ class StoredSteps:
 
     def _open(self, tile: Tile) -> tuple[Reader, AnalysisContext]:
         """Read the pixels of a tile alone."""
-        part: CountSource = self._ready.steady
+        part: records.CountSource = self._ready.steady
         if tile.shape != self._ready.shape:
             part = CutFrames(part, tile.shape, lambda images: images[..., *tile.here])
         camera = self._ready.camera.part(tile.here)
         return reader_of(part, self._config, camera, self._span), self._field.on_tile(tile)
 
-    def __call__(self, row: int) -> EventView:
+    def __call__(self, row: int) -> records.EventView:
         """Draw a row of the table."""
         table, config, window = self._table, self._config, self._window
         tile = self._tile_around(table.iloc[row])
@@ -371,7 +359,7 @@ class StoredSteps:
             chunk, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
         neighbours = Neighbours(context, chunk, window, pattern)
         near = (table["frame"] - frame).abs() < 3 * window
-        known = near & table["mass_kda"].notna() & is_event(table)
+        known = near & table["mass_kda"].notna() & records.is_event(table)
         known &= tile.holds(table["y_px"].to_numpy(float), table["x_px"].to_numpy(float))
         numbers = [row, *(int(i) for i in np.flatnonzero(known) if i != row)]
         steps = [_step(neighbours, table.iloc[i], tile.corner) for i in numbers]
@@ -409,7 +397,7 @@ def _step(neighbours: Neighbours, row: pd.Series[Any], corner: tuple[int, int]) 
         per_frame_snr=float(row["snr"]) / math.sqrt(max(frames, 1.0)), p_constant=1.0,
     )  # fmt: skip
     mass = float(row["mass_kda"])
-    start = Candidate(
+    start = records.Candidate(
         float(row["x_px"]) - corner[1], float(row["y_px"]) - corner[0], float(row["z_nm"]),
         abs(mass), float(row["snr"]),
     )  # fmt: skip

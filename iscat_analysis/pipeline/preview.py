@@ -55,6 +55,12 @@ class Preview:
         The frames with what is unsteady in their light divided out.
     prepared : Prepared
         All that an analysis knows of the movie before it learns the optics.
+    window : int
+        Frames that `analyse` sums: as configured, or chosen from the noise.
+    longest : int
+        Frames that a window may have at most.
+    frames : (int, int)
+        Frames that `analyse` looks at, half-open.
 
     Raises
     ------
@@ -82,23 +88,9 @@ class Preview:
         self.config = self.prepared.over_all_stretches().config
         self.notes = tuple(notes)
         self.camera, self.steady = self.prepared.known, self.prepared.steady
-        self._search = kind_of(self.config).search(self.prepared)
+        self._search = search = kind_of(self.config).search(self.prepared)
+        self.window, self.longest, self.frames = search.window, search.longest, search.frames
         self._lock = threading.Lock()  # a viewer may ask from several threads
-
-    @property
-    def window(self) -> int:
-        """Frames that `analyse` sums: as configured, or chosen from the noise."""
-        return self._search.window
-
-    @property
-    def longest(self) -> int:
-        """Frames that a window may have at most."""
-        return self._search.longest
-
-    @property
-    def frames(self) -> tuple[int, int]:
-        """Frames that `analyse` looks at, half-open."""
-        return self._search.frames
 
     def threshold(self, window: int | None = None) -> float:
         """Give the threshold that is configured.

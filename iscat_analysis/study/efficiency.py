@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from iscat_analysis.movie.tables import refuse_twice
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
 from iscat_analysis.study.setting import OF_DIPOLES
-from iscat_analysis.study.yardstick import Limits, limits_at, resamples, score_estimates
+from iscat_analysis.study.yardstick import Limits, limits_at, score_estimates
 
 _MASS_STEP = 0.02
 _Z_STEP_NM = 2.0
@@ -118,8 +119,7 @@ def efficiency(
     config, free = _resolved(setup, mode)
     seed = int(number_in("`seed`", seed, least=0, whole=True))
     columns, truths = matched(_table("estimates", estimates), _table("truth", truth), config, free)
-    limits = limits_of_many(config, free, truths)
-    scored = score_estimates(columns, truths, limits, resamples(len(truths), seed))
+    scored = score_estimates(columns, limits_of_many(config, free, truths), seed)
     if not scored:
         raise DataError(f"estimates: has none of the columns {', '.join(free)}")
     return pd.DataFrame(scored.values(), index=pd.Index(scored.keys(), name="parameter"))
@@ -143,8 +143,7 @@ def _numbers(table: pd.DataFrame, name: str) -> FloatArray:
     Shapes: result (n,).
     """
     cells = table[name].map(lambda cell: cell if isinstance(cell, (Real, str)) else math.nan)
-    numbers: FloatArray = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=float)
-    return numbers
+    return np.asarray(pd.to_numeric(cells, errors="coerce"), dtype=float)
 
 
 def limits_of_many(
@@ -170,7 +169,7 @@ def limits_of_many(
     kinds, inverse = np.unique(keys, axis=0, return_inverse=True)
     places = np.insert(kinds[:, :2], [0], [at.x_nm, at.y_nm], axis=1)
     one = limits_at(experiment, free, places, frames=kinds[:, 2:].astype(int).tolist())
-    return one.for_rows(inverse.reshape(-1).tolist())
+    return replace(one.for_rows(inverse.reshape(-1).tolist()), truths=truths)
 
 
 def _resolved(setup: Setup, mode: str | None) -> tuple[Config, tuple[str, ...]]:

@@ -34,8 +34,6 @@ LEAST_PARTS = 32
 PARTS_OF_GROUP = 8
 """Parts of a group at least, so that its covariance is its own."""
 
-MOST_GROUPS = 1024
-"""Groups at most, of particles that cross the picture in one exposure."""
 
 FINE = 0.2
 """Largest spread of a group in the picture's finest wave [rad]."""
@@ -60,14 +58,6 @@ class MovingParticle:
     def still(self) -> bool:
         """Whether it does not move at all."""
         return bool((self.points_nm == self.mean_nm[0]).all())
-
-
-@dataclass(frozen=True)
-class _Clock:
-    """Interval and exposure [s]."""
-
-    interval_s: float
-    exposure_s: float
 
 
 def place_movers(
@@ -122,7 +112,8 @@ def track_rows(
             )  # fmt: skip
 
 
-def _clock(config: Config) -> _Clock:
+def _clock(config: Config) -> tuple[float, float]:
+    """Give the interval between frames, and the exposure [s]."""
     camera = config.camera
     if camera.frame_rate_hz is None:
         raise ConfigError(
@@ -137,7 +128,7 @@ def _clock(config: Config) -> _Clock:
             f"from frame to frame at camera.frame_rate_hz = {camera.frame_rate_hz:g}: correct one "
             "of them"
         )
-    return _Clock(interval, min(exposure, interval))
+    return interval, min(exposure, interval)
 
 
 def _start(
@@ -167,7 +158,7 @@ def _start(
 def _move(
     config: Config,
     kind: SimulatedMover,
-    clock: _Clock,
+    clock: tuple[float, float],
     start: FloatArray,
     roaming_px: float | None,
     rng: np.random.Generator,
@@ -178,10 +169,10 @@ def _move(
     axes = 3 if kind.space == "volume" else 2
     d, velocity = kind.d_um2_s * _UM2, np.array([*kind.drift_um_s, 0.0]) * 1e3
     moves = d > 0 or bool(velocity.any())
-    groups = _groups(config, kind, clock)
+    interval_s, exposure_s = clock
+    groups = _groups(config, kind, exposure_s)
     parts = max(LEAST_PARTS, PARTS_OF_GROUP * groups) if moves else 1
-    part_s = clock.exposure_s / parts
-    dark_s = clock.interval_s - clock.exposure_s
+    part_s, dark_s = exposure_s / parts, interval_s - exposure_s
     path = np.zeros((frames, parts, 3))
     ends = np.zeros((frames, parts, 3))
     if moves:
@@ -191,7 +182,7 @@ def _move(
         ends[..., :axes] = np.cumsum(gone.reshape(-1, axes), axis=0).reshape(gone.shape)
         bridge = rng.standard_normal((frames, parts, axes)) * math.sqrt(d * part_s / 6)
         path[..., :axes] = ends[..., :axes] - ways / 2 + bridge
-        elapsed = np.arange(frames)[:, None] * clock.interval_s + part_s * np.arange(1, parts + 1)
+        elapsed = np.arange(frames)[:, None] * interval_s + part_s * np.arange(1, parts + 1)
         ends += elapsed[..., None] * velocity
         path += (elapsed - part_s / 2)[..., None] * velocity
     turn = np.zeros(frames, dtype=np.int64)
@@ -242,16 +233,17 @@ def _turned(
     return np.concatenate([[0], np.cumsum(crossed)]).astype(np.int64), shift
 
 
-def _groups(config: Config, kind: SimulatedMover, clock: _Clock) -> int:
+def _groups(config: Config, kind: SimulatedMover, e: float) -> int:
     """Count the groups of parts that are drawn apart; see the module."""
-    optics, e = config.optics, clock.exposure_s
+    optics = config.optics
     speed = 1e3 * math.hypot(*kind.drift_um_s)
     spread = math.sqrt(kind.d_um2_s * _UM2 * e / 3 + (speed * e) ** 2 / 12)
     wave = 2 * math.pi * optics.na / optics.wavelength_nm
     if kind.space == "volume":
         wave = 4 * math.pi * optics.n_sample / optics.wavelength_nm
     groups = 1
-    while groups < MOST_GROUPS and wave * spread / math.sqrt(groups) > FINE:
+    # groups at most, of particles that cross the picture in one exposure
+    while groups < 1024 and wave * spread / math.sqrt(groups) > FINE:
         groups *= 2
     return groups
 

@@ -7,8 +7,7 @@ how many they left out.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,10 +46,6 @@ class Score:
     coverage95_ci95: tuple[float, float] = _NOTHING
     pull_mean: float = math.nan
     pull_std: float = math.nan
-
-    def plain(self) -> dict[str, Any]:
-        """As nested plain values, for JSON."""
-        return asdict(self)
 
 
 def score(error: FloatArray, sigma: FloatArray, crb: float, qcrb: float) -> Score:

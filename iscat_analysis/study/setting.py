@@ -24,14 +24,9 @@ from iscat_analysis.optics.model import photons_per_intensity
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Candidate, FloatArray, Windows
 from iscat_analysis.study.estimator_setup import EstimatorSetup
 
-CLEARANCE = 8.0
-"""Standard deviations that a height kept by default has to the ends of ``fit.z_range_nm``."""
-
 START_PX = 1.0
 """How far a start lies from the particle along x and y, at most [pixels]."""
 
-START_MASS = 1.5
-"""Factor between a start's mass and the particle's, at most."""
 
 OF_DIPOLES, OF_SPHERES = ("mass", "localize", "joint"), ("size", "localize")
 """Modes that fit dipoles, and those that fit spheres."""
@@ -181,7 +176,8 @@ class Setting:
         """
         shift = random.uniform(-START_PX, START_PX, 2)
         place = truth[:2] / self.context.pixel_nm + shift
-        factor = START_MASS ** random.uniform(-1, 1)
+        # factor between a start's mass and the particle's, at most
+        factor = 1.5 ** random.uniform(-1, 1)
         low, high = self.config.fit.z_range_nm
         z = random.uniform(low, high)
         return Candidate(
@@ -345,7 +341,8 @@ def _clear_of_ends(
     step = context.model.fringe_nm / 16
     for candidate in np.arange(max(height, low), high, step):
         bounds = _experiment(config, context, candidate, collected).bounds(FREE_PARAMETERS[mode])
-        margin = CLEARANCE * bounds.crb_joint[z]
+        # standard deviations that a height kept by default has to the ends of ``fit.z_range_nm``
+        margin = 8.0 * bounds.crb_joint[z]
         if candidate - low > margin and high - candidate > margin:
             return float(candidate)
     return (low + high) / 2

@@ -50,7 +50,6 @@ TRACK_COLUMNS = ("track", "d_um2_s", "x_middle_nm", "y_middle_nm", "z_middle_nm"
 """Those added where particles move; a row then holds for one frame, with averaged places."""
 
 _STREAMS = {"background": 0, "power": 1, "events": 2, "frames": 3, "movers": 4}
-_HEIGHTS = 64  # of a particle that moves up and down, to find its highest contrast
 _BATCH = 32  # frames drawn at once
 _MARGIN_PX = 8  # around what is ever seen of a sample that drifts
 _NO_UUID = "urn:uuid:00000000-0000-0000-0000-000000000000"
@@ -404,7 +403,8 @@ class Movie:
         for p in self.movers:
             heights = np.unique(p.mean_nm[:, 2])
             if heights.size > 1:
-                heights = np.linspace(heights[0], heights[-1], _HEIGHTS)
+                # of a particle that moves up and down, to find its highest contrast
+                heights = np.linspace(heights[0], heights[-1], 64)
             kinds |= {(float(z), p.mass_kda) for z in heights}
         return {kind: self._model.peak_contrast(*kind) for kind in kinds}
 

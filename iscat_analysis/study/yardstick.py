@@ -40,34 +40,30 @@ FAR = 4.0
 FOLLOWS = 0.2
 """An estimator whose mean moves less than this share of the truth does not estimate it."""
 
-VARIED = 1e-6
-"""Variation of the truth, in units of the bound, below which there is no gradient to measure."""
-
-PER_SLOPE = 5
-"""Particles for each slope of the line, without which it would go through them by itself."""
 
 _WIDE = float(ndtri(0.975))
 
 
-def resamples(count: int, seed: int, number: int = RESAMPLES) -> FloatArray:
+def resamples(count: int, seed: int) -> FloatArray:
     """Weights of the bootstrap's resamples; the first row is the sample itself.
 
-    Shapes: result (number + 1, count).
+    Shapes: result (RESAMPLES + 1, count).
     """
     random = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, count])))
-    out = np.ones((number + 1, count))
-    for row in range(1, number + 1):
+    out = np.ones((RESAMPLES + 1, count))
+    for row in range(1, RESAMPLES + 1):
         out[row] = np.bincount(random.integers(0, count, count), minlength=count)
     return out
 
 
 def score_estimates(
-    columns: Mapping[str, FloatArray], truths: FloatArray, limits: Limits, weights: FloatArray
+    columns: Mapping[str, FloatArray], limits: Limits, seed: int
 ) -> dict[str, dict[str, Any]]:
     """Score every free parameter that an estimator gives.
 
-    Shapes: `columns` (n,) each, `truths` (n, 4), `weights` (resamples, n).
+    Shapes: `columns` (n,) each.
     """
+    truths, weights = limits.truths, resamples(len(limits), seed)
     index = [PARAMETERS.index(name) for name in limits.free]
     deviation = truths[:, index] - truths[:, index].mean(axis=0)
     out = {}
@@ -137,7 +133,8 @@ def _line(
 
     Shapes: `scaled, constant` (n,), `slopes` (n, d), result (resamples,) and (resamples, d).
     """
-    varied = (np.std(slopes, axis=0) > VARIED) & (len(slopes) >= _enough(slopes.shape[1]))
+    # variation of the truth, in units of the bound, below which there is no gradient to measure
+    varied = (np.std(slopes, axis=0) > 1e-6) & (len(slopes) >= _enough(slopes.shape[1]))
     features = np.column_stack([constant, slopes[:, varied]])
     size = np.sqrt(np.mean(features**2, axis=0))
     features = features / size
@@ -155,7 +152,8 @@ def _line(
 
 def _enough(parameters: int) -> int:
     """Say how many particles it takes to measure gradients of the bias."""
-    return PER_SLOPE * (1 + parameters)
+    # particles for each slope of the line, without which it would go through them by itself
+    return 5 * (1 + parameters)
 
 
 def _own_errors(error: FloatArray, sigma: FloatArray, w: FloatArray) -> dict[str, FloatArray]:
@@ -216,15 +214,15 @@ def paired(
 def beside_best(
     columns: Mapping[str, Mapping[str, FloatArray]],
     scores: Mapping[str, Mapping[str, Any]],
-    truths: FloatArray,
     limits: Limits,
-    weights: FloatArray,
+    seed: int,
 ) -> dict[str, Any]:
     """Compare all estimators with the most efficient one that is not below its bound.
 
-    Shapes: `truths` (n, 4), `weights` (resamples, n).
+    Shapes: `columns` (n,) each.
     """
     out: dict[str, Any] = {}
+    weights = resamples(len(limits), seed)
     for i, name in enumerate(limits.free):
         ranked = {
             who: entry[name]["efficiency_crb"]
@@ -235,7 +233,7 @@ def beside_best(
         if not ranked:
             continue
         best = max(ranked, key=lambda who: ranked[who])
-        truth = truths[:, PARAMETERS.index(name)]
+        truth = limits.truths[:, PARAMETERS.index(name)]
         errors = {who: one[name] - truth for who, one in columns.items() if name in one}
         out[name] = {"to": best} | {
             who: paired(error, errors[best], limits.crb[:, i], weights)
@@ -297,18 +295,15 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2))) if values.size else math.nan
 
 
-MOST_BOUNDS = 64
-"""Bounds that are computed for particles that are nearly alike."""
-
-
 @dataclass(frozen=True, eq=False)
 class Limits:
     """Bounds of n particles over d free parameters, in their order [nm, kDa].
 
-    Shapes: `covariance` (n, d, d), `qcrb, holevo` (n, d), `snr, collected` (n,).
+    Shapes: `truths` (n, 4), `covariance` (n, d, d), `qcrb, holevo` (n, d), `snr, collected` (n,).
     """
 
     free: tuple[str, ...]
+    truths: FloatArray
     covariance: FloatArray
     qcrb: FloatArray
     holevo: FloatArray
@@ -326,10 +321,8 @@ class Limits:
 
     def for_rows(self, rows: Sequence[int]) -> Limits:
         """Take the bounds of some particles, any of them more than once."""
-        return Limits(
-            self.free, self.covariance[rows], self.qcrb[rows], self.holevo[rows], self.snr[rows],
-            self.collected[rows],
-        )  # fmt: skip
+        free, *arrays = vars(self).values()
+        return Limits(free, *(array[rows] for array in arrays))
 
 
 def limits_at(
@@ -351,8 +344,7 @@ def limits_at(
             truths, frames or [(at.n_before, at.n_after)] * len(truths), strict=True
         )
     ]
-    covariance, qcrb, holevo, snr, collected = (np.array(part) for part in zip(*found, strict=True))
-    return Limits(free, covariance, qcrb, holevo, snr, collected)
+    return Limits(free, truths, *(np.array(part) for part in zip(*found, strict=True)))
 
 
 def limits_of_alike(
@@ -362,12 +354,13 @@ def limits_of_alike(
 
     Shapes: `truths` (n, 4).
     """
-    few = limits_at(experiment, free, truths[:MOST_BOUNDS], level=level)
+    # bounds that are computed for particles that are nearly alike
+    few = limits_at(experiment, free, truths[:64], level=level)
     n = len(truths)
     squared = (np.sqrt(np.mean(part**2, axis=0)) for part in (few.qcrb, few.holevo))
     qcrb, holevo = (np.tile(part, (n, 1)) for part in squared)
     return Limits(
-        free, np.tile(few.covariance.mean(axis=0), (n, 1, 1)), qcrb, holevo,
+        free, truths, np.tile(few.covariance.mean(axis=0), (n, 1, 1)), qcrb, holevo,
         np.full(n, few.snr.mean()), np.full(n, few.collected.mean()),
     )  # fmt: skip
 

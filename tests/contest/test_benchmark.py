@@ -268,7 +268,7 @@ def test_page_shows_how_sure_each_spread_is(study: dict[str, dict[str, object]])
 @pytest.mark.usefixtures("sketched")
 def test_page_of_a_study_without_usable_fits(study: dict[str, dict[str, object]]) -> None:
     kept = study["joint"]["z_nm"]
-    nothing = score(np.zeros(0), np.zeros(0), kept["crb"], kept["qcrb"]).plain()
+    nothing = vars(score(np.zeros(0), np.zeros(0), kept["crb"], kept["qcrb"]))
     none = {key: (math.nan,) * 2 for key in kept if key.startswith("posterior")}
     lost = {**study["joint"], "z_nm": {**kept, **none, **nothing, "posterior_coverage68": math.nan,
                                        "posterior_coverage95": math.nan}}  # fmt: skip

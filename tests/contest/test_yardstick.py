@@ -103,12 +103,11 @@ def test_intervals_hold_the_efficiency_in_as_many_studies_as_they_say(config) ->
     """200 studies of 100 trials; the nominal 95 % with 4 standard errors and some for the small."""
     random = np.random.default_rng(6)
     limits = limits_of_many(config, FREE, np.array([[0.0, 0.0, 100.0, 1000.0]]))
-    weights = resamples(100, 1)
     covered = 0
-    truth = np.array([0.0, 0.0, 100.0, 1000.0]) + np.zeros((100, 4))
+    limits = limits.for_rows([0] * 100)
     for _ in range(200):
         noise = random.normal(size=100) * limits.crb[0, 0]
-        found = score_estimates({"x_nm": noise}, truth, limits.for_rows([0] * 100), weights)
+        found = score_estimates({"x_nm": noise}, limits, 1)
         low, high = found["x_nm"]["efficiency_crb_ci95"]
         covered += low < 1 < high
     assert covered > 200 * 0.95 - 4 * np.sqrt(200 * 0.95 * 0.05) - 4
@@ -254,10 +253,10 @@ def test_every_built_in_estimator_finds_a_bright_particle(name: str, in_focus) -
     found = answer(find_estimator(name).load(), in_focus.job)
     assert not found.failures
     for axis, column in enumerate(("x_nm", "y_nm")):
-        error = np.abs(found.columns[column] - in_focus.truths[:, axis])
+        error = np.abs(found.columns[column] - in_focus.limits.truths[:, axis])
         assert np.median(error) < 80
     if "mass_kda" in found.columns:
-        ratio = found.columns["mass_kda"] / in_focus.truths[:, 3]
+        ratio = found.columns["mass_kda"] / in_focus.limits.truths[:, 3]
         assert np.median(ratio) == pytest.approx(1, abs=0.25)
 
 
@@ -265,6 +264,6 @@ def test_all_estimators_see_the_same_counts() -> None:
     setting = make_setting(configuration(**SMALL), "mass")
     first, again = (draw(setting, 5, seed=3, stream=1) for _ in range(2))
     np.testing.assert_array_equal(first.job.after, again.job.after)
-    assert np.all(np.ptp(first.truths[:, [0, 1, 3]], axis=0) > 0)
-    assert np.ptp(first.truths[:, 2]) == 0
+    assert np.all(np.ptp(first.limits.truths[:, [0, 1, 3]], axis=0) > 0)
+    assert np.ptp(first.limits.truths[:, 2]) == 0
     assert not np.array_equal(first.job.after, draw(setting, 5, seed=4, stream=1).job.after)

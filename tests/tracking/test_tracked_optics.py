@@ -16,7 +16,7 @@ from wanderers import SETTINGS, Wanderers, wander
 import iscat_analysis as ia
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.findings import Findings
+from iscat_analysis.findings import Findings, warnings_in
 from iscat_analysis.instrument import loop
 from iscat_analysis.instrument.joint_fit import excess
 from iscat_analysis.instrument.loop import Round, Rounds
@@ -228,4 +228,4 @@ def test_rounds_end_where_the_first_four_describe_nothing(
         _, summary = learn_from_tracks(config, begin, name="m", pool=pool, run=run)
     assert len(seen) == 2 * rounds  # of all particles, and of those that stand alone
     assert not summary["calibrated"]
-    assert "other optics were not learned: not yet" in told.warnings[0]
+    assert "other optics were not learned: not yet" in warnings_in(told.made)[0]
