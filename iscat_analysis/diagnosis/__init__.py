@@ -27,7 +27,7 @@ from iscat_analysis.diagnosis.causes import (
     uneven_warning,
 )
 from iscat_analysis.diagnosis.frames import without_cut_off
-from iscat_analysis.diagnosis.motion import DRIFT_PX, drift_warning, examine_background
+from iscat_analysis.diagnosis.light import DRIFT_PX, drift_warning, examine_background
 from iscat_analysis.diagnosis.noise import (
     SPECTRUM_FRAMES,
     Noise,

@@ -21,8 +21,12 @@ from iscat_analysis import camera as cameras
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.causes import axes_warning
 from iscat_analysis.diagnosis.frames import KeptFrames, refuse_channels, without_repeats
-from iscat_analysis.diagnosis.light import JudgedLight, judge_light
-from iscat_analysis.diagnosis.motion import motion_in, with_drift_correction
+from iscat_analysis.diagnosis.light import (
+    JudgedLight,
+    judge_light,
+    motion_in,
+    with_drift_correction,
+)
 from iscat_analysis.diagnosis.noise import NoiseSurvey, law_finding, survey_noise
 from iscat_analysis.diagnosis.recognise import Changes, look_at_changes
 from iscat_analysis.diagnosis.stretches import Stretches, find_stretches
