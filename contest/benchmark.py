@@ -102,8 +102,7 @@ def run_benchmark(
         )
     threads = config.compute.workers if workers is None else workers
     fewer = max(trials // CURVE_SHARE, LEAST_TRIALS)
-    # A posterior is sampled for one in this many trials
-    posteriors = max(trials // 20, MIN_TRIALS) if posterior else 0
+    posteriors = max(trials // 20, MIN_TRIALS) if posterior else 0  # one in so many trials
     if estimators:
         refuse_sphere(config, "the estimators of others are of dipoles")
     modes = OF_SPHERES if config.particle.is_sphere else OF_DIPOLES
@@ -154,9 +153,7 @@ def run_benchmark(
         "histograms": histograms,
         "trials": trials,
         "seed": seed,
-        "scheme": config.optics.scheme,
-        "emission": config.optics.emission,
-        "convention": config.optics.convention,
+        **{name: getattr(config.optics, name) for name in ("scheme", "emission", "convention")},
         "command": command or "iscat_contest.benchmark.run_benchmark",
         "config": config_to_toml(config),
         "versions": {

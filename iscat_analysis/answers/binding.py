@@ -165,10 +165,7 @@ def fit_kd(
     name = "samples" if isinstance(samples, pd.DataFrame) else str(samples)
     rows, totals, found, findings = _series(samples, name, model, tables, options)
     masses, about = _masses(found, model, options["masses_kda"])
-    events = [  # without a limit of detection, which is fitted then
-        table.events if table.edge_kda is None else replace(table.events, efficiency=None)
-        for table in found
-    ]
+    events = [t.events if t.edge_kda is None else replace(t.events, efficiency=None) for t in found]
     how: Any = {"power": options["landing_power"], "inactive": options["inactive"]}
     fit = fit_equilibrium(events, totals, model=model, masses_kda=masses, **how)
     _refuse_undetected(name, fit)
