@@ -82,7 +82,6 @@ def test_fits_of_ambiguous_height_that_are_left_out_are_told(
 ) -> None:
     dim = ["--set", "bounds.photons_per_pixel=20", "--set", "fit.roi_nm=900", "--no-posterior"]
     arguments = ["--config", str(sample_configs["mass"]), "--out", str(tmp_path / "out"), *dim]
-    arguments += ["--estimator", "iscat"]
     assert main(["benchmark", *arguments, "--trials", "20"]) == 0
     said = capsys.readouterr().err
     assert "mode joint: 20 of 20 fits have the status ambiguous_z and are left out" in said

@@ -118,6 +118,8 @@ def test_every_example_runs(
     if "view" in arguments:
         Path("movie.iscat").mkdir()
         Path("movie.iscat/report.html").write_text("<title>a page</title>", encoding="utf-8")
+    if "figures" in arguments:
+        assert main(["fit", "kept.tif", "--config=setup.toml", "--out=movie.iscat"]) == 0
     if "watch" in arguments:
         Path("movies").mkdir()
         monkeypatch.setattr("iscat_analysis.day.watch.WatchedFolder.check", _interrupt)
@@ -138,7 +140,7 @@ def test_every_example_runs(
     if "simulate" in arguments:
         arguments += [f"--set={change}" for change in SMALL]
     if "--trials" in arguments:
-        arguments += ["--no-posterior", "--set", "fit.roi_nm=900", "--estimator", "iscat"]
+        arguments += ["--no-posterior", "--set", "fit.roi_nm=900"]
         arguments[arguments.index("--trials") + 1] = "20"  # fewer; the shape stays the same
     if "species" in arguments:
         arguments += ["--draws", "3"]
