@@ -41,3 +41,10 @@ NO_TRACK = caution(
     "look at the field image, at track.max_step_nm, which is the farthest a particle goes between "
     "frames, and at detection.false_alarms_per_movie",
 )
+
+INTERRUPTED = caution(
+    "interrupted",
+    "the analysis was interrupted: these are the particles of the part that was finished",
+    "run it again, which goes on where it ended",
+    subject=Subject.CAMERA,
+)

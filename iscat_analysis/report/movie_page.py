@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.findings import Finding, Severity, Subject
-from iscat_analysis.findings.results import NOT_A_MASS, NOTHING_FOUND
+from iscat_analysis.findings.results import INTERRUPTED, NOT_A_MASS, NOTHING_FOUND
 from iscat_analysis.records import (
     EVENTS,
     PARAMETERS,
@@ -260,6 +260,8 @@ def _all_findings(sample: Sample) -> list[Finding]:
     analysis, table = sample.analysis, counted(sample.fits)
     judged = table if sample.kind is EVENTS_KIND else tracks_of(analysis)
     found = list(analysis.findings)
+    if analysis.summary.get("interrupted"):
+        found.insert(0, INTERRUPTED())
     if table.empty:
         found.append(NOTHING_FOUND())
     else:

@@ -477,3 +477,12 @@ def test_bounds_of_a_diameter_have_its_unit() -> None:
     assert sample.parameter("mass_kda") == "diameter [nm]"
     assert found.holevo == pytest.approx(3.0 / 50)
     assert found.crb == pytest.approx(whole.crb / 50, rel=0.05)
+
+
+def test_an_interrupted_run_says_so_on_its_first_screen() -> None:
+    analysis = make_analysis(20)
+    page = render_report(replace(analysis, summary={**analysis.summary, "interrupted": True}))
+    first = re.search(r'<ul class="trust".*?</ul>', page, re.DOTALL)
+    assert first is not None
+    assert "The analysis was interrupted" in first[0]
+    assert "interrupted" not in render_report(analysis)
