@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
@@ -20,6 +20,7 @@ import pandas as pd
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.optics.scatterers import Sphere, material, scattering_length_nm, sphere_of
 from iscat_analysis.records import (
+    BUDGET_COLUMNS,
     Analysis,
     FloatArray,
     PosteriorResult,
@@ -67,14 +68,18 @@ BRIGHT = ("#56b4e9", "#ff8a3d", "#2fd6a3", "#f0a5cf", "#ffd166", "#b5e3ff")
 UNSORTED, UNSORTED_BRIGHT = "#7d858f", "#f0e442"
 """Colours of particles that belong to no species."""
 
-PICTURE_PX = 560
-"""Longest side of a field on the screen."""
+PICTURE_PX, PICTURE_TALL_PX = 560, 420
+"""Width and height of a field on the screen, at most."""
 MOST_PATH_POINTS = 20_000
 """Points of paths on a page; of more, some are left out."""
 RINGS = ((200, 240), (1000, 90), (math.inf, 20))
 """Sizes of rings around so many particles at most, so that the field is seen between them."""
 MOST_ERRORS = 400
 """Tracks whose errors are drawn beside their dots."""
+MOST_LINE_POINTS = 1000
+"""Points of a line over the movie."""
+MOST_DOTS = 300
+"""Particles whose errors are drawn against their bounds; of more, some are left out."""
 MSD_PART = 4
 """Longest lag of a mean-squared displacement: the track's length over this."""
 MSD_TRACKS = 6
@@ -299,41 +304,29 @@ class Sample:
     @cached_property
     def events(self) -> dict[str, list[Any]]:
         """The data set that figures of particles share, one row for each particle."""
-        rows, (values, sigma), (x, y) = self.rows, self.values, self._places()
-        found: dict[str, Sequence[Any]] = {
-            "event": rows["event"].tolist(),
-            "frame": rows[self.kind.begins].tolist(),
-            "time": self.time[0].tolist(),
-            "x": x,
-            "y": y,
-            "value": values.tolist(),
-            "sigma": sigma.tolist(),
-            "species": self.members.tolist(),
-            "status": rows["status"].astype(str).tolist(),
-        }
-        if self.kind is not EVENTS_KIND:
-            found |= {"d": rows["d_um2_s"].tolist(), "sigma_d": rows["sigma_d_um2_s"].tolist()}
-        return columns_of_lists(found)
-
-    def _places(self) -> tuple[list[Any], list[Any]]:
-        """Give where each particle is, or where its track begins [px]."""
+        rows, (values, sigma), places = self.rows, self.values, self.rows
+        moving = {"d": "d_um2_s", "sigma_d": "sigma_d_um2_s"}
         if self.kind is EVENTS_KIND:
-            return self.rows["x_px"].tolist(), self.rows["y_px"].tolist()
-        first = self.fits.assign(track=track_numbers(self.fits)).sort_values("frame")
-        first = first.drop_duplicates("track").set_index("track")
-        begun = first.reindex(self.rows["event"])
-        return begun["x_px"].tolist(), begun["y_px"].tolist()
+            moving = {}
+        else:  # where each track begins
+            first = self.fits.assign(track=track_numbers(self.fits)).sort_values("frame")
+            places = first.drop_duplicates("track").set_index("track").reindex(rows["event"])
+        found = {
+            "event": rows["event"],
+            "frame": rows[self.kind.begins],
+            "time": self.time[0],
+            "x": places["x_px"].to_numpy(),
+            "y": places["y_px"].to_numpy(),
+            "value": values,
+            "sigma": sigma,
+            "species": self.members,
+            "status": rows["status"].astype(str),
+        }
+        return columns_of(found | {name: rows[column] for name, column in moving.items()})
 
 
 def _displayed(quantity: Quantity) -> Quantity:
     return replace(quantity, unit=THOUSANDTH) if quantity.column == "contrast" else quantity
-
-
-def columns_of_lists(columns: Mapping[str, Sequence[Any]]) -> dict[str, list[Any]]:
-    """Round the numbers of columns."""
-    from iscat_analysis.report.vega import plain_values
-
-    return {name: plain_values(values) for name, values in columns.items()}
 
 
 # ---- All figures ---------------------------------------------------------------------------------
@@ -396,31 +389,28 @@ def masses(sample: Sample) -> VegaFigure:
     wide = bin_width(values[kept], sigma[kept & sample.is_ok])
     bars = _bars(values[kept], sample.is_ok[kept], wide)
     curves = _curves(sample)
-    tops = {
-        k: max(
-            [wide * d for d, s in zip(*_pick(curves, "density", "species"), strict=True) if s == k]
-            or [0.0]
-        )
-        for k in range(len(sample.species))
-    }
     unit = f" {sample.quantity.unit}".rstrip()
-    peaks = [
-        {
-            "value": each.value,
-            "species": k,
-            "label": f"{each.name}{unit}",
-            "share": f"{fixed(each.count, 0)} · {percent(each.share, 0)}",
-            "curve": tops[k] / wide,
-            "height": max(tops[k], _top(bars, each.value)),
-        }
-        for k, each in enumerate(sample.species)
-    ]
+    peaks = []
+    for k, each in enumerate(sample.species):
+        near = bars[(bars["low"] - wide <= each.value) & (each.value < bars["high"] + wide)]
+        curve = float(curves["density"][curves["species"] == k].max())
+        peaks.append(
+            {
+                "value": each.value,
+                "species": k,
+                "label": f"{each.name}{unit}",
+                "share": f"{fixed(each.count, 0)} · {percent(each.share, 0)}",
+                "curve": curve,
+                "height": np.nanmax([curve * wide, near["top"].max()]),
+            }
+        )
     words = {
         "title": sample.quantity.label.capitalize(),
         "counted": f"{sample.kind.noun}s",
         "bin": wide,
     }
-    data = {"bars": bars, "curves": curves, "peaks": columns_of(peaks)}
+    data = {name: columns_of(v) for name, v in (("bars", bars), ("curves", curves))}
+    data["peaks"] = columns_of(peaks)
     drawn = figure("masses", data, {**sample.words, **words})
     return described(drawn, _sentence(sample))
 
@@ -432,38 +422,23 @@ def _sentence(sample: Sample) -> str:
     return f"{text}; species: {'; '.join(names)}." if names else f"{text}."
 
 
-def _pick(columns: Mapping[str, list[Any]], *names: str) -> list[list[Any]]:
-    return [columns.get(name, []) for name in names]
-
-
-def _bars(values: FloatArray, ok: Any, wide: float) -> dict[str, list[Any]]:
+def _bars(values: FloatArray, ok: Any, wide: float) -> pd.DataFrame:
     """Count values in bins whose edges are multiples of their width; flagged ones on top."""
     first, last = (math.floor(float(end) / wide) for end in (values.min(), values.max()))
     edges = wide * np.arange(first, last + 2)
     good, bad = (np.histogram(values[part], edges)[0] for part in (ok, ~ok))
-    rows = [
-        {"low": low, "high": high, "bottom": base, "top": base + many, "count": many, "part": part}
-        for part, counts, bases in (("ok", good, 0 * good), ("flagged", bad, good))
-        for low, high, many, base in zip(edges, edges[1:], counts, bases, strict=False)
-        if many
-    ]
-    return columns_of(rows)
+    bins = pd.DataFrame({"low": edges[:-1], "high": edges[1:]})
+    parts = (
+        bins.assign(bottom=0, top=good, count=good, part="ok"),
+        bins.assign(bottom=good, top=good + bad, count=bad, part="flagged"),
+    )
+    return pd.concat(parts).query("count > 0")
 
 
-def _top(bars: Mapping[str, list[Any]], value: float) -> float:
-    """Give the height of the bar at a value, or of a neighbour where that is higher."""
-    near = [
-        top
-        for low, high, top in zip(bars["low"], bars["high"], bars["top"], strict=True)
-        if low - (high - low) <= value < high + (high - low)
-    ]
-    return float(max(near, default=0.0))
-
-
-def _curves(sample: Sample) -> dict[str, list[Any]]:
+def _curves(sample: Sample) -> pd.DataFrame:
     """Split the fitted density of all particles among the species, by what each is there."""
     if not sample.species:
-        return {}
+        return pd.DataFrame()
     if sample.quantity.column.endswith("diameter_nm"):
         found = (sample.described("sizes") or {})["curve"]
         grid, model = np.array(found["diameter_nm"]), np.array(found["model"])
@@ -474,21 +449,14 @@ def _curves(sample: Sample) -> dict[str, list[Any]]:
         with np.errstate(divide="ignore"):
             model = np.array(found["model"]) / (sample.scale * power * mass ** (power - 1))
     typical = float(np.nanmedian(sample.values[1])) if len(sample.rows) else 0.0
-    centre, count, width = np.array([[s.value, s.count, s.width] for s in sample.species]).T[
-        ..., None
-    ]
+    known = np.array([[each.value, each.count, each.width] for each in sample.species])
+    centre, many, width = known.T[..., None]
     spread = np.maximum(np.hypot(width, typical), 1e-9)
-    parts = count / spread * np.exp(-(((grid - centre) / spread) ** 2) / 2)
+    parts = many / spread * np.exp(-(((grid - centre) / spread) ** 2) / 2)
     whole = parts.sum(axis=0)
-    shares = np.divide(parts, whole, out=np.zeros_like(parts), where=whole > 0)
-    least = 1e-3 * float(np.nanmax(model))
-    rows = [
-        {"species": k, "value": value, "density": density}
-        for k, share in enumerate(shares)
-        for value, density in zip(grid, share * model, strict=True)
-        if density > least
-    ]
-    return columns_of(rows)
+    density = np.divide(parts, whole, out=np.zeros_like(parts), where=whole > 0) * model
+    k, at = np.nonzero(density > 1e-3 * np.nanmax(model))
+    return pd.DataFrame({"species": k, "value": grid[at], "density": density[k, at]})
 
 
 # ---- Where and when ------------------------------------------------------------------------------
@@ -499,10 +467,8 @@ def _picture(sample: Sample, bright: float) -> tuple[dict[str, list[Any]], dict[
     image = np.asarray(sample.analysis.ratio_image, float)
     low, high = (bright * end for end in display_range([image], sample.analysis.scheme))
     rows, columns = image.shape
-    scale = PICTURE_PX / max(rows, columns) if rows > columns else PICTURE_PX / columns
-    wide, tall = columns * scale, min(max(rows * scale, 60), 420)
-    if rows * scale > 420:
-        wide = max(wide * 420 / (rows * scale), 60)
+    scale = min(PICTURE_PX / columns, PICTURE_TALL_PX / rows)
+    wide, tall = (max(scale * side, PICTURE_PX / 9) for side in (columns, rows))
     picture = {
         "url": data_uri(grey_png((image - low) / (high - low), int(2 * PICTURE_PX))),
         "x": (columns - 1) / 2,
@@ -534,11 +500,7 @@ def paths(sample: Sample) -> VegaFigure:
     fits = fits[fits["event"].isin(sample.rows["event"])].sort_values(["event", "frame"])
     fits = fits.iloc[:: 1 + len(fits) // MOST_PATH_POINTS]
     walked = fits[["event", "frame", "x_px", "y_px"]].rename(columns={"x_px": "x", "y_px": "y"})
-    data = {
-        "picture": picture,
-        "paths": columns_of(walked.to_dict("records")),
-        "events": sample.events,
-    }
+    data = {"picture": picture, "paths": columns_of(walked), "events": sample.events}
     return figure("paths", data, {**sample.words, **words})
 
 
@@ -546,25 +508,20 @@ def time(sample: Sample) -> VegaFigure:
     """Show the main quantity against time, and how many particles come in each part of it."""
     at, name, rate = sample.time
     course = sample.analysis.summary.get("timeline") or {}
-    end = max([*(course.get("events") or {}).get("edges", ()), *(at * rate + 1)][-1:] or [1.0])
-    span = [0.0, max(float(end), float(at.max() * rate + 1)) / rate]
-    counts, edges = np.histogram(at, bins=40, range=(span[0], span[1]))
-    rows = [
-        {"start": low, "stop": high, "count": many}
-        for low, high, many in zip(edges, edges[1:], counts, strict=False)
-    ]
-    left_out = [
-        {"start": one["start"] / rate, "stop": one["stop"] / rate, "what": one["what"]}
-        for one in course.get("intervals", ())
-    ]
+    last = max([*(course.get("events") or {}).get("edges", ()), float(at.max() * rate) + 1])
+    span = [0.0, last / rate]
+    counts, edges = np.histogram(at, bins=40, range=(0.0, last / rate))
+    left_out = pd.DataFrame(course.get("intervals", ()), columns=["start", "stop", "what"])
+    left_out[["start", "stop"]] /= rate
     per = f"{number(edges[1], 2)} s" if name != "frame" else f"{edges[1]:g} frames"
     words = {
         "time": name,
         "span": span,
         "rate": f"per {per}",
         "width": PICTURE_PX,
-        "caption": "Shaded: frames that are left out or partly hidden." if left_out else "",
+        "caption": "Shaded: frames that are left out or partly hidden." if len(left_out) else "",
     }
+    rows = {"start": edges[:-1], "stop": edges[1:], "count": counts}
     data = {"events": sample.events, "rate": columns_of(rows), "intervals": columns_of(left_out)}
     return figure("time", data, {**sample.words, **words})
 
@@ -612,27 +569,23 @@ def limit(sample: Sample) -> VegaFigure | None:
 
 def precision(sample: Sample) -> VegaFigure | None:
     """Show σ and QCRB of each particle against its CRB, for every free parameter."""
-    table, rows = sample.scaled(counted(sample.fits)), []
+    table, parts = sample.scaled(counted(sample.fits)), []
     for name in sample.free:
-        label = sample.parameter(name)
-        kept = table[np.isfinite(table[f"crb_{name}"].to_numpy(float))]
-        kept = kept.iloc[:: 1 + len(kept) // 300]
-        bounds = kept[f"crb_{name}"].tolist()
-        if not bounds:
-            continue
-        for end in (min(bounds), max(bounds)):
-            rows.append({"parameter": label, "event": -1, "kind": "CRB", "crb": end, "value": end})
-        judged = np.where(kept["status"] == Status.OK.value, "σ", "σ, flagged").tolist()
-        for kind, column in ((judged, "sigma"), (["QCRB"] * len(kept), "qcrb")):
-            values = kept[f"{column}_{name}"].tolist()
-            rows += [
-                {"parameter": label, "event": event, "kind": what, "crb": bound, "value": value}
-                for event, what, bound, value in zip(
-                    kept["event"], kind, bounds, values, strict=True
-                )
-                if value > 0 and bound > 0
-            ]
-    return figure("precision", {"precision": columns_of(rows)}) if rows else None
+        kept = table[table[f"crb_{name}"] > 0]
+        kept = kept.iloc[:: 1 + len(kept) // MOST_DOTS]
+        bound, ok = kept[f"crb_{name}"], kept["status"] == Status.OK.value
+        ends = [bound.min(), bound.max()]
+        own = pd.DataFrame({"event": kept["event"], "crb": bound})
+        parts += [
+            part.assign(parameter=sample.parameter(name))
+            for part in (
+                pd.DataFrame({"event": -1, "crb": ends, "value": ends, "kind": "CRB"}),
+                own.assign(value=kept[f"sigma_{name}"], kind=np.where(ok, "σ", "σ, flagged")),
+                own.assign(value=kept[f"qcrb_{name}"], kind="QCRB"),
+            )
+        ]
+    rows = pd.concat(parts).query("value > 0")
+    return figure("precision", {"precision": columns_of(rows)}) if len(rows) else None
 
 
 def spread(sample: Sample) -> VegaFigure | None:
@@ -640,44 +593,32 @@ def spread(sample: Sample) -> VegaFigure | None:
 
     In mode ``track``, where none are, against the frames since the background.
     """
-    analysis, rows = sample.analysis, []
+    analysis, parts = sample.analysis, []
     tracked = analysis.mode_kind.follows_tracks
+    own, whole = (
+        ("no particle", "all frames, 95 %") if tracked else ("own frames", "estimates, 95 %")
+    )
     for name, part in analysis.summary.get("precision", {}).items():
-        if part.get("repeat_over_crb") is None:
+        if (reached := part.get("repeat_over_crb")) is None:
             continue
-        label = sample.label(name)
-
-        def row(
-            kind: str, frames: float, value: float, low: float, high: float, label: str = label
-        ) -> dict[str, Any]:
-            ends = {"value": value, "low": low, "high": high}
-            return {"parameter": label, "kind": kind, "frames": frames, **ends}
-
-        curve = (
-            part["repeat_frames"],
-            part["repeat_over_crb_by_frames"],
-            part["repeat_over_crb_by_frames_se"],
+        curve = {"frames": part["repeat_frames"], "value": part["repeat_over_crb_by_frames"]}
+        curve |= {"error": part["repeat_over_crb_by_frames_se"], "kind": own}
+        measured = pd.DataFrame(curve).astype({"value": float, "error": float})
+        measured = measured.query("frames > 0").fillna({"error": 0.0})
+        measured = measured.assign(
+            low=measured["value"] - measured["error"], high=measured["value"] + measured["error"]
         )
-        for at, value, error in zip(*curve, strict=True):
-            if value is not None and at:
-                reach = error or 0.0
-                kind = "no particle" if tracked else "own frames"
-                rows.append(row(kind, at, value, value - reach, value + reach))
-        last = (
-            float(np.median(counted(analysis.table)["n_after"]))
-            if not tracked
-            else max([at for at in part["repeat_frames"] if at] or [1.0])
-        )
-        if not tracked and part["empty_over_crb"]:
-            for share, value in zip(
-                (1 / 8, 1 / 4, 1 / 2, 1), part["empty_over_crb"][1:], strict=False
-            ):
-                if value is not None:
-                    rows.append(row("no particle", last * share, value, value, value))
-        ends = part["repeat_over_crb_ci95"]
-        kind = "all frames, 95 %" if tracked else "estimates, 95 %"
-        rows.append(row(kind, last, part["repeat_over_crb"], ends[0], ends[1]))
-    if not rows:
+        last = measured["frames"].max() if tracked else counted(analysis.table)["n_after"].median()
+        low, high = part["repeat_over_crb_ci95"]
+        end = {"frames": last, "value": reached, "low": low, "high": high, "kind": whole}
+        found = [measured, pd.DataFrame([end])]
+        if not tracked and (empty := part["empty_over_crb"][1:]):
+            lengths = last * np.array([1 / 8, 1 / 4, 1 / 2, 1])[: len(empty)]
+            kept = {"frames": lengths, "value": empty, "low": empty, "high": empty}
+            found.append(pd.DataFrame(kept | {"kind": "no particle"}))
+        parts += [one.assign(parameter=sample.label(name)) for one in found]
+    rows = pd.concat(parts).dropna(subset=["value"]) if parts else pd.DataFrame()
+    if rows.empty:
         return None
     words = {
         "across": "frames since the background" if tracked else "frames averaged",
@@ -690,20 +631,18 @@ def spread(sample: Sample) -> VegaFigure | None:
         )
         + " At 1 the noise is as the bound has it.",
     }
-    return figure("spread", {"spread": columns_of(rows)}, words)
+    return figure("spread", {"spread": columns_of(rows.drop(columns="error"))}, words)
 
 
 def budget(sample: Sample) -> VegaFigure | None:
     """Show a bar for each source of the error of a mass, the largest first."""
-    known = [one for one in sample.analysis.summary.get("budget", ()) if one["sigma_rel"]]
-    known = sorted(known, key=lambda one: -one["sigma_rel"])
-    kept = [one for one in known if one["sigma_rel"] > 1e-3 * known[0]["sigma_rel"]]
-    names = ("name", "kind", "common", "remedy")
-    rows = [
-        {**{name: one[name] for name in names}, "percent": 100 * one["sigma_rel"]} for one in kept
-    ]
+    known = pd.DataFrame(sample.analysis.summary.get("budget", ()), columns=list(BUDGET_COLUMNS))
+    known = known.assign(percent=100 * known["sigma_rel"].astype(float))
+    known = known[known["percent"] > 1e-3 * known["percent"].max()]
+    known = known.sort_values("percent", ascending=False, kind="stable")
+    rows = known[["name", "kind", "common", "remedy", "percent"]]
     words = {"height": 24 * len(rows)}
-    return figure("budget", {"budget": columns_of(rows)}, words) if rows else None
+    return figure("budget", {"budget": columns_of(rows)}, words) if len(rows) else None
 
 
 # ---- Diagnostics ---------------------------------------------------------------------------------
@@ -717,9 +656,7 @@ def efficiency(sample: Sample) -> VegaFigure | None:
     chance = found["curves"]["efficiency"]
     if min(value for value in chance if value is not None) >= 1:
         return None
-    curve = [
-        {"value": m, "chance": c} for m, c in zip(found["curves"]["mass_kda"], chance, strict=True)
-    ]
+    curve = {"value": found["curves"]["mass_kda"], "chance": chance}
     dots = [
         {"value": s["mass_kda"], "chance": s["efficiency"], "label": number(s["mass_kda"])}
         for s in found["species"]
@@ -729,40 +666,34 @@ def efficiency(sample: Sample) -> VegaFigure | None:
     return figure("efficiency", data, sample.words)
 
 
-def _histogram(
-    values: FloatArray, edges: FloatArray, expected: list[dict[str, float]], title: str,
-    quantity: str, caption: str,
-) -> VegaFigure:  # fmt: skip
-    counts, edges = np.histogram(values, edges)
-    bars = [
-        {"low": low, "high": high, "count": many}
-        for low, high, many in zip(edges, edges[1:], counts, strict=False)
-    ]
-    words = {"title": title, "quantity": quantity, "caption": caption, "counted": "fits"}
-    return figure("histogram", {"bars": columns_of(bars), "expected": columns_of(expected)}, words)
+def _histogram(sample: Sample, column: str, words: Mapping[str, str]) -> VegaFigure | None:
+    """Show how a number of each fit is distributed, and what is expected of it."""
+    values = sample.fits[column].dropna().to_numpy(float)
+    if values.size < 2:
+        return None
+    edges = np.linspace(0, 1, 21)
+    expected = {"x": [0.0, 1.0], "y": values.size / 20}
+    if column == "chi2_reduced":
+        edges = np.histogram_bin_edges(values, bins=int(np.clip(np.sqrt(values.size), 8, 40)))
+        expected = {"x": 1.0, "y": [0.0, float(np.histogram(values, edges)[0].max())]}
+    counts = np.histogram(values, edges)[0]
+    bars = {"low": edges[:-1], "high": edges[1:], "count": counts}
+    data = {"bars": columns_of(bars), "expected": columns_of(expected)}
+    return figure("histogram", data, {**words, "counted": "fits"})
 
 
 def chi2(sample: Sample) -> VegaFigure | None:
     """Show the histogram of the reduced χ²."""
-    values = sample.fits["chi2_reduced"].dropna().to_numpy(float)
-    if values.size < 2:
-        return None
-    edges = np.histogram_bin_edges(values, bins=int(np.clip(np.sqrt(values.size), 8, 40)))
-    top = float(np.histogram(values, edges)[0].max())
-    expected = [{"x": 1.0, "y": 0.0}, {"x": 1.0, "y": top}]
     caption = "Where model and noise describe the data it is near 1 (dashed)."
-    return _histogram(values, edges, expected, "Misfit", "reduced χ²", caption)
+    words = {"title": "Misfit", "quantity": "reduced χ²", "caption": caption}
+    return _histogram(sample, "chi2_reduced", words)
 
 
 def p_values(sample: Sample) -> VegaFigure | None:
     """Show the histogram of the p-values."""
-    values = sample.fits["p_value"].dropna().to_numpy(float)
-    if values.size < 2:
-        return None
-    expected = [{"x": x, "y": values.size / 20} for x in (0.0, 1.0)]
     caption = "Where model and noise describe the data it is flat (dashed)."
-    edges = np.linspace(0, 1, 21)
-    return _histogram(values, edges, expected, "Probability of the misfit", "p-value", caption)
+    words = {"title": "Probability of the misfit", "quantity": "p-value", "caption": caption}
+    return _histogram(sample, "p_value", words)
 
 
 def noise(sample: Sample) -> VegaFigure | None:
@@ -772,10 +703,7 @@ def noise(sample: Sample) -> VegaFigure | None:
     frames = found.get("noise_frames", ())
     if len(frames) < 2:
         return None
-    rows = [
-        {"frames": at, "ratio": ratio}
-        for at, ratio in zip(frames, found["noise_variance_over_shot"], strict=True)
-    ]
+    rows = {"frames": frames, "ratio": found["noise_variance_over_shot"]}
     return figure("noise", {"noise": columns_of(rows)})
 
 
@@ -785,33 +713,30 @@ def course(sample: Sample) -> VegaFigure | None:
     found = analysis.summary.get("timeline")
     if not found:
         return None
-    edges = found["events"]["edges"]
+    edges, noun, frames = found["events"]["edges"], sample.kind.noun, found["frames"]
     middles = [(low + high) / 2 for low, high in pairwise(edges)]
     series: list[tuple[str, str, Any, Any]] = [
         ("light, relative", "", analysis.power_frames, analysis.power),
-        ("noise, variance over expected", "", found["frames"], found["noise_over_expected"]),
-        ("focus [nm]", "", found["frames"], found["focus_nm"]),
-        ("drift [px]", "x", found["frames"], found["drift_x_px"]),
-        ("drift [px]", "y", found["frames"], found["drift_y_px"]),
-        (f"{sample.kind.noun}s, ok", "", middles, found["events"]["ok"]),
-        (f"{sample.kind.noun}s, flagged", "", middles, found["events"]["flagged"]),
+        ("noise, variance over expected", "", frames, found["noise_over_expected"]),
+        ("focus [nm]", "", frames, found["focus_nm"]),
+        ("drift [px]", "x", frames, found["drift_x_px"]),
+        ("drift [px]", "y", frames, found["drift_y_px"]),
+        (f"{noun}s, ok", "", middles, found["events"]["ok"]),
+        (f"{noun}s, flagged", "", middles, found["events"]["flagged"]),
     ]
     if not analysis.scheme_kind.interferes:
         series = [one for one in series if one[0] != "focus [nm]"]
-    rows = []
-    for name, line, frames, values in series:
-        at = np.asarray(frames, float)
-        level = np.array([math.nan if value is None else value for value in values], dtype=float)
-        if not np.isfinite(level).any() or not level.any():
-            continue
-        step = 1 + at.size // 1000
-        rows += [
-            {"series": name, "line": line, "frame": frame, "value": value}
-            for frame, value in zip(at[::step], level[::step], strict=True)
-        ]
-    gaps = [{"start": one["start"], "stop": one["stop"]} for one in found["intervals"]]
-    data = {"course": columns_of(rows), "gaps": columns_of(gaps)}
-    return figure("course", data, {"width": PICTURE_PX}) if rows else None
+    parts = []
+    for name, line, at, values in series:
+        rows = pd.DataFrame({"series": name, "line": line, "frame": at, "value": values})
+        rows["value"] = rows["value"].astype(float)
+        if rows["value"].fillna(0.0).any():
+            parts.append(rows.iloc[:: 1 + len(rows) // MOST_LINE_POINTS])
+    gaps = pd.DataFrame(found["intervals"], columns=["start", "stop"])
+    if not parts:
+        return None
+    data = {"course": columns_of(pd.concat(parts)), "gaps": columns_of(gaps)}
+    return figure("course", data, {"width": PICTURE_PX})
 
 
 # ---- Tracks --------------------------------------------------------------------------------------
@@ -833,17 +758,15 @@ def msd(sample: Sample) -> VegaFigure | None:
     exposure_s = 1 / rate if exposure is None else exposure / 1e3
     bad = (usable["status"] != Status.OK.value).to_numpy(bool)
     ranked = usable.iloc[np.lexsort([-usable["n_d_frames"], bad])].head(MSD_TRACKS)
-    numbers, rows = track_numbers(sample.fits), []
+    numbers, parts = track_numbers(sample.fits), []
     for track in ranked.to_dict("records"):
         path = sample.fits[numbers == track["track"]].drop_duplicates("frame").sort_values("frame")
         lags, measured, error = mean_squared_displacement(path)
         seconds = lags / rate
         predicted = 4 * track["d_um2_s"] * (seconds - exposure_s / 3) + error / _UM2
-        rows += [
-            {"track": track["track"], "lag": 1e3 * lag, "measured": one, "predicted": two}
-            for lag, one, two in zip(seconds, measured / _UM2, predicted, strict=True)
-        ]
-    return figure("msd", {"msd": columns_of(rows)}) if rows else None
+        found = {"lag": 1e3 * seconds, "measured": measured / _UM2, "predicted": predicted}
+        parts.append(pd.DataFrame(found | {"track": track["track"]}))
+    return figure("msd", {"msd": columns_of(pd.concat(parts))}) if parts else None
 
 
 def mean_squared_displacement(path: pd.DataFrame) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -895,28 +818,23 @@ def size_plane(sample: Sample) -> VegaFigure | None:
     kinds = [(f"{n:.2f}", replace(sphere, index=complex(n), shell_nm=0.0)) for n in INDICES]
     absorbs = abs(sphere.index.imag) >= step
     lines = [
-        {
-            "index": label,
-            "own": one is sphere,
-            "diameter": d,
-            "length": value,
-            "last": d == diameters[-1],
-        }
+        pd.DataFrame(
+            {"diameter": diameters, "length": lengths(diameters, one), "index": label}
+        ).assign(own=one is sphere, last=diameters == diameters[-1])
         for label, one in ([] if absorbs else [*kinds, (own, sphere)])
-        for d, value in zip(diameters, lengths(diameters, one), strict=True)
     ]
-    ok = (tracks["status"] == Status.OK.value).to_numpy(bool)
     dots = {
-        "event": tracks["track"].tolist(),
-        "diameter": moved.tolist(),
-        "low": (moved - error).tolist(),
-        "high": (moved + error).tolist(),
-        "length": length.tolist(),
-        "length_low": (length - up).tolist(),
-        "length_high": (length + up).tolist(),
-        "judged": np.where(ok, "ok", "flagged").tolist(),
+        "event": tracks["track"],
+        "diameter": moved,
+        "low": moved - error,
+        "high": moved + error,
+        "length": length,
+        "length_low": length - up,
+        "length_high": length + up,
+        "judged": np.where(tracks["status"] == Status.OK.value, "ok", "flagged"),
     }
-    return figure("sizes", {"materials": columns_of(lines), "spheres": columns_of_lists(dots)})
+    materials = columns_of(pd.concat(lines)) if lines else {}
+    return figure("sizes", {"materials": materials, "spheres": columns_of(dots)})
 
 
 _DETAILS: Mapping[str, Any] = {
@@ -945,27 +863,15 @@ def trace_data(trace: Trace) -> dict[str, dict[str, list[Any]]]:
     parts = trace.contrast[start : start + many * length].reshape(many, length)
     some = np.flatnonzero(np.isfinite(parts).any(axis=1))
     frames = trace.first + np.arange(len(trace.contrast))
-    used = trace.used
-    return {
-        "frames": columns_of_lists(
-            {"frame": frames.tolist(), "contrast": np.round(1e3 * trace.contrast, 3).tolist()}
-        ),
-        "means": columns_of_lists(
-            {
-                "frame": (trace.first + start + (some + 0.5) * length).tolist(),
-                "contrast": np.round(1e3 * np.nanmean(parts[some], axis=1), 3).tolist(),
-            }
-        ),
-        "step": columns_of_lists(
-            {
-                "order": [0, 1, 2, 3],
-                "frame": [used[0], trace.frame, trace.frame, used[1]],
-                "contrast": [
-                    1e3 * level for level in (trace.before, trace.before, trace.after, trace.after)
-                ],
-            }
-        ),
+    middles = trace.first + start + (some + 0.5) * length
+    turns = [trace.used[0], trace.frame, trace.frame, trace.used[1]]
+    levels = np.array([trace.before, trace.before, trace.after, trace.after])
+    data = {
+        "frames": {"frame": frames, "contrast": np.round(1e3 * trace.contrast, 3)},
+        "means": {"frame": middles, "contrast": np.round(1e3 * np.nanmean(parts[some], axis=1), 3)},
+        "step": {"order": range(4), "frame": turns, "contrast": 1e3 * levels},
     }
+    return {name: columns_of(columns) for name, columns in data.items()}
 
 
 def _corners(analysis: Analysis) -> Iterator[tuple[str, VegaFigure]]:
@@ -983,26 +889,23 @@ def corner(posterior: PosteriorResult, event: int) -> VegaFigure:
     """Show a posterior: each parameter, and each pair."""
     names = [parameter(name) for name in posterior.names]
     flat = posterior.samples.reshape(-1, len(names))
-    rows = []
+    parts = []
     for i, j in np.ndindex(len(names), len(names)):
         if j < i:
             counts, x, y = np.histogram2d(flat[:, j], flat[:, i], bins=CORNER_BINS)
             shades = credible_shades(counts)
-            cells = [
-                (x[a], x[a + 1], y[b], y[b + 1], int(shades[a, b]))
-                for a, b in np.argwhere(shades > 0)
-            ]
+            a, b = np.nonzero(shades)
+            cells = {"bottom": y[b], "top": y[b + 1], "shade": shades[a, b]}
         elif j == i:
             heights, x = np.histogram(flat[:, i], bins=CORNER_BINS, density=True)
-            cells = [(x[a], x[a + 1], 0.0, heights[a], 2) for a in range(CORNER_BINS)]
+            a = np.arange(CORNER_BINS)
+            cells = {"bottom": 0.0, "top": heights, "shade": 2}
         else:
             continue
-        keys = ("left", "right", "bottom", "top", "shade")
-        rows += [
-            {"row": names[i], "column": names[j], **dict(zip(keys, cell, strict=True))}
-            for cell in cells
-        ]
-    return figure("corner", {"corner": columns_of(rows)}, {"title": f"Posterior of event {event}"})
+        own = {"row": names[i], "column": names[j], "left": x[a], "right": x[a + 1]}
+        parts.append(pd.DataFrame(own | cells))
+    rows = columns_of(pd.concat(parts))
+    return figure("corner", {"corner": rows}, {"title": f"Posterior of event {event}"})
 
 
 def credible_shades(counts: FloatArray) -> Any:

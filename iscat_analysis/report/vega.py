@@ -19,6 +19,7 @@ from string import Template
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from iscat_analysis.errors import DataError
 
@@ -160,11 +161,10 @@ def libraries() -> str:
 # ---- Data sets -----------------------------------------------------------------------------------
 
 
-def columns_of(rows: Iterable[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Turn records into columns; all records have the keys of the first."""
-    found = list(rows)
-    names = found[0] if found else ()
-    return {name: plain_values(row[name] for row in found) for name in names}
+def columns_of(rows: Any) -> dict[str, list[Any]]:
+    """Turn records, a table, or columns, of which one may be a single value, into columns."""
+    table = pd.DataFrame(rows)
+    return {str(name): plain_values(table[name].tolist()) for name in table}
 
 
 def plain_values(values: Iterable[Any]) -> list[Any]:
