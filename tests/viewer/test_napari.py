@@ -8,6 +8,7 @@ os.environ["QT_QPA_PLATFORM"] = "offscreen"  # before Qt is imported
 
 import gc
 import importlib
+import json
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -189,8 +190,8 @@ def test_tracks_are_those_of_the_exporter(viewer, tmp_path) -> None:
     described = describe_tracks(fits, SETUP)
     described.to_parquet(out / "tracks.parquet", index=False)
     (out / "config.toml").write_text('[fit]\nmode = "track"\n', encoding="utf-8")
-    summary = '{"mode": "track", "input": {"path": "gone.tif", "sha256": ""}}'
-    (out / "summary.json").write_text(summary, encoding="utf-8")
+    about = {"mode": "track", "input": {"path": "gone.tif", "sha256": ""}}
+    (out / "summary.json").write_text(json.dumps(about | {"versions": {}, "seed": 0, "findings": []}))
     tracks, points = viewer.open(str(out), plugin=PLUGIN)
     np.testing.assert_array_equal(tracks.data, ia.to_napari(fits))
     masses = described.set_index("track")["mass_kda"].loc[tracks.data[:, 0].astype(int)]
