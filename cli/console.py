@@ -13,7 +13,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Container, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -27,8 +27,6 @@ from iscat_analysis.options import BindingOptions, SpeciesOptions, Told, options
 from iscat_cli import INTERRUPTED
 
 if TYPE_CHECKING:
-    from rich.progress import Progress as Bars
-    from rich.progress import TaskID
     from rich.table import Table
 
     from iscat_analysis.findings import Finding
@@ -36,7 +34,6 @@ if TYPE_CHECKING:
     from iscat_analysis.report.numbers import Table as Made
 
 UNEXPECTED = 1
-SECONDS_TO_FIRST_LINE = 2.0
 
 
 class _Console(Console):
@@ -133,89 +130,16 @@ class Messages:
     @contextmanager
     def progress(self) -> Iterator[Progress]:
         """Show how far the work is: bars on a terminal, a line now and then elsewhere."""
-        with ExitStack() as stack:
-            shown: Progress = _Lines(self)
-            if self._terminal.is_terminal and not self.quiet:
-                from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
-                from rich.progress import Progress as Bars
+        from iscat_analysis.progress import Lines, bars
 
-                columns = (
-                    TextColumn("{task.description}"),
-                    BarColumn(),
-                    TextColumn("{task.fields[steps]}"),
-                    TimeRemainingColumn(elapsed_when_finished=True),
-                )
-                bars = Bars(*columns, console=self._terminal, transient=True)
-                shown = _Drawing(stack.enter_context(bars))
+        bar = self._terminal.is_terminal and not self.quiet
+        with bars(self._terminal) if bar else Lines(self.note) as shown:
 
             def watched(stage: str, done: int, total: int) -> None:
                 self.writing = stage == "report" and done < total
                 shown(stage, done, total)
 
             yield watched
-
-
-class _Drawing:
-    """Progress as bars with the time left; one without end moves while no stage reports."""
-
-    def __init__(self, bars: Bars) -> None:
-        self._bars = bars
-        self._lock = threading.Lock()
-        self._tasks: dict[str, TaskID] = {}
-        self._between = bars.add_task("working", total=None, steps="")
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        with self._lock:
-            if stage not in self._tasks:
-                self._tasks[stage] = self._bars.add_task(stage, total=total, steps="")
-            steps = f"{done}/{total}"
-            self._bars.update(self._tasks[stage], completed=done, total=total, steps=steps)
-            self._bars.update(self._between, visible=done >= total)
-
-
-class _Lines:
-    """Progress as lines of text: the end of each stage, and a sign of life in between."""
-
-    def __init__(self, messages: Messages) -> None:
-        self._messages = messages
-        self._lock = threading.Lock()
-        self._last_notice = ""
-        self._stage = ""
-        self._first = (0.0, 0)  # when the stage first reported, and how much was done
-        self._due = time.monotonic() + SECONDS_TO_FIRST_LINE
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        with self._lock:
-            now = time.monotonic()
-            if stage != self._stage:
-                if self._stage:
-                    self._due = now + SECONDS_TO_FIRST_LINE
-                self._stage, self._first = stage, (now, done)
-            text = f"{stage}: {done} of {total}"
-            if done < total:
-                if now < self._due:
-                    return
-                self._due = now + 10.0
-                begun, known = self._first
-                if done > known:
-                    left = (now - begun) * (total - done) / (done - known)
-                    text += f", about {duration(left)} left"
-            else:
-                self._stage, self._due = "", now + SECONDS_TO_FIRST_LINE
-            if text == self._last_notice:  # a stage that is run again has said so already
-                return
-            self._last_notice = text
-        self._messages.note(text)
-
-
-def duration(seconds: float) -> str:
-    """Write a time as people say it: ``"8 s"``, ``"3 min"`` or ``"2 h 5 min"``."""
-    if seconds < 100:
-        return f"{math.ceil(seconds)} s"
-    minutes = math.ceil(seconds / 60)
-    if minutes < 100:
-        return f"{minutes} min"
-    return f"{minutes // 60} h {minutes % 60} min"
 
 
 @contextmanager

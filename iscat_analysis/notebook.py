@@ -30,6 +30,7 @@ from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.pipeline.stored import MovieResult
+from iscat_analysis.progress import automatic, told
 from iscat_analysis.records import (
     Analysis,
     EventView,
@@ -37,7 +38,6 @@ from iscat_analysis.records import (
     PosteriorResult,
     Progress,
     Status,
-    silent,
 )
 from iscat_analysis.report import check_output, write_report
 from iscat_analysis.report.exchange import to_napari, to_trackpy
@@ -239,7 +239,8 @@ class Bounds:
         """Bounds for one scattered photon, on the camera (CRB) or collected [nm, relative]."""
         return self._frame("per_photon")
 
-    def scan(self, values: str, *, progress: Progress = silent) -> pd.DataFrame:
+    @told
+    def scan(self, values: str, *, progress: Progress = automatic) -> pd.DataFrame:
         """Vary one thing and compute the bounds at each step.
 
         Parameters
@@ -282,6 +283,7 @@ class Bounds:
         return f"<p><b>{html.escape(in_page(self._heading()))}</b></p>{body}"
 
 
+@told
 def fit_movie(
     movie: str | Path | ArrayLike,
     *,
@@ -299,7 +301,7 @@ def fit_movie(
     out: str | Path | None = None,
     overwrite: bool = False,
     figures: bool = False,
-    progress: Progress = silent,
+    progress: Progress = automatic,
 ) -> Result:
     """Fit the particles of a movie; in memory, unless `out` names a folder.
 
@@ -339,7 +341,8 @@ def fit_movie(
     figures : bool
         Draw figures for papers into `out`, as `Result.save` does.
     progress : Progress
-        Called with the stage and the steps done and in all.
+        Called with the stage and the steps done and in all; default bars with the time left where
+        stderr is a terminal, a line in a notebook, and nothing elsewhere.
 
     Returns
     -------
@@ -382,6 +385,7 @@ def fit_movie(
     return result
 
 
+@told
 def calibrate_optics(
     movie: str | Path | ArrayLike,
     *,
@@ -392,7 +396,7 @@ def calibrate_optics(
     focus_step_nm: float | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = automatic,
 ) -> OpticsCalibration:
     """Learn the optics from a movie of particles; in memory, unless `out` names a folder.
 
@@ -416,7 +420,8 @@ def calibrate_optics(
     overwrite : bool
         Replace an earlier result in `out`.
     progress : Progress
-        Called with the stage and the steps done and in all.
+        Called with the stage and the steps done and in all; default bars with the time left where
+        stderr is a terminal, a line in a notebook, and nothing elsewhere.
 
     Returns
     -------
@@ -442,6 +447,7 @@ def calibrate_optics(
         return calibrate_movie(stack, resolved, **learned)
 
 
+@told
 def simulate_movie(
     config: Source,
     path: str | Path,
@@ -449,7 +455,7 @@ def simulate_movie(
     seed: int | None = None,
     settings: Settings | None = None,
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = automatic,
 ) -> pd.DataFrame:
     """Write a shot-noise movie of particles whose position and mass are known.
 

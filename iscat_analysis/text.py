@@ -9,12 +9,14 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sized
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import pandas as pd
 
+_LONGEST = 60  # characters of a value in `brief`
 _UNSEEN = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f"  # control characters, but not tabs and ends of lines
     "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"  # marks that turn the direction of text
@@ -94,3 +96,19 @@ def _is_number(text: str) -> bool:
         return math.isfinite(float(text))
     except ValueError:
         return False
+
+
+def brief(record: Any) -> str:
+    """Write a record for a notebook: arrays and tables by their shape, what is long by its type."""
+    parts = []
+    for field in fields(record):
+        value = getattr(record, field.name)
+        text = repr(value) if not hasattr(value, "shape") else ""
+        if not text:
+            text = f"<{type(value).__name__} {' × '.join(map(str, value.shape))}>"
+        elif len(text) > _LONGEST or "\n" in text:
+            number = f" of {len(value)}" if isinstance(value, Sized) else ""
+            text = f"<{type(value).__name__}{number}>"
+        if not field.name.startswith("_"):
+            parts.append(f"{field.name}={text}")
+    return f"{type(record).__name__}({', '.join(parts)})"

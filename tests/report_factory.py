@@ -254,7 +254,7 @@ def summary_of(table: pd.DataFrame, mode: str, scheme: str) -> dict[str, object]
         ],
         "precision": {"x_nm": {f"{name}_median": 1.5 for name in medians}},
         "seconds": {"fit": np.float64(1.25)},
-        "input": {"path": HOSTILE, "sha256": "0" * 64},
+        "input": {"path": HOSTILE, "sha256": "0" * 64, "shape": [1000, 128, 128]},
         "seed": 1,
         "versions": {"iscat-analysis": "0.1.0", "python": "3.11.7", "numpy": "2.1.0"},
         "findings": [],

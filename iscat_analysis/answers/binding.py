@@ -37,7 +37,7 @@ from iscat_analysis.species.equilibrium import (
     landing_logits,
 )
 from iscat_analysis.species.tables import EventTable, event_table, mass_in, refuse_far, sentences
-from iscat_analysis.text import from_table, in_table
+from iscat_analysis.text import brief, from_table, in_table
 from iscat_analysis.units import count
 
 CONCENTRATIONS: dict[Model, tuple[str, ...]] = {
@@ -77,6 +77,8 @@ class Binding:
     samples: pd.DataFrame
     curve: pd.DataFrame
     notes: tuple[str, ...]
+
+    __repr__ = brief
 
     def to_dict(self) -> dict[str, Any]:
         """Give the document ``kd``.

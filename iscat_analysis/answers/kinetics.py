@@ -44,6 +44,7 @@ from iscat_analysis.reading import read_text, toml_of
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.species.maximum import TWO_SIDED_95, interval
 from iscat_analysis.species.tables import EventTable, event_table
+from iscat_analysis.text import brief
 
 IndexArray: TypeAlias = NDArray[np.int64]
 """Rows of a table."""
@@ -224,6 +225,8 @@ class Kinetics:
     frame_rate_hz: float
     frames: tuple[int, int]
     findings: tuple[Finding, ...]
+
+    __repr__ = brief
 
     @property
     def notes(self) -> tuple[str, ...]:

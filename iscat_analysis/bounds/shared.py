@@ -47,6 +47,7 @@ from iscat_analysis.optics.parameters import (
     settings_of,
 )
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
+from iscat_analysis.text import brief
 from iscat_analysis.threads import one_thread_algebra
 
 _PEAK_POINTS = 61  # per axis, of the grid on which the peak of a contrast is looked for
@@ -172,6 +173,8 @@ class OpticsForecast:
     moves: dict[str, FloatArray]
     sigma: dict[str, FloatArray]
     needed: pd.DataFrame
+
+    __repr__ = brief
 
     @cached_property
     def parameters(self) -> pd.DataFrame:

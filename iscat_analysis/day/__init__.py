@@ -42,11 +42,12 @@ from iscat_analysis.files import whole_file
 from iscat_analysis.inference.checks import path_in, shown
 from iscat_analysis.movie import files_of
 from iscat_analysis.options import DayOptions, takes
-from iscat_analysis.records import Progress, silent
+from iscat_analysis.progress import automatic, told
+from iscat_analysis.records import Progress
 from iscat_analysis.report.batch import BatchContents, Curve, batch_page, summary_line
 from iscat_analysis.report.output import atomic_folder
 from iscat_analysis.report.tables import CSV_DIGITS
-from iscat_analysis.text import from_table, in_table
+from iscat_analysis.text import brief, from_table, in_table
 from iscat_analysis.units import count
 
 __all__ = ["Batch", "Table", "batch", "read_table"]
@@ -80,6 +81,8 @@ class Batch:
     analysed: tuple[str, ...]
     failed: tuple[tuple[str, str], ...]
 
+    __repr__ = brief
+
     @property
     def page(self) -> Path:
         """The page that shows everything."""
@@ -106,6 +109,7 @@ class Batch:
 
 
 @takes(DayOptions)
+@told
 def batch(
     samples: str | Path | Table,
     *,
@@ -113,7 +117,7 @@ def batch(
     only: tuple[int, int] | None = None,
     merge: bool = False,
     retry: bool = True,
-    progress: Progress = silent,
+    progress: Progress = automatic,
     notify: Notify | None = None,
     command: str = "",
     **options: Unpack[DayOptions],

@@ -39,6 +39,7 @@ from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie import Stack, files_of, find_movies, is_open_to_write, open_stack
 from iscat_analysis.options import DayOptions, takes
 from iscat_analysis.pipeline import analyse, fit_stack
+from iscat_analysis.progress import automatic, told
 from iscat_analysis.reading import is_folder
 from iscat_analysis.records import Analysis, Progress, Status, silent
 from iscat_analysis.report.output import check_output
@@ -172,13 +173,14 @@ Ready = tuple[Table, tuple[State | None, ...]]
 
 
 @takes(DayOptions)
+@told
 def watch(
     folder: str | Path,
     *,
     out: str | Path | None = None,
     interval_s: float = 10.0,
     stop: threading.Event | None = None,
-    progress: Progress = silent,
+    progress: Progress = automatic,
     notify: Notify | None = None,
     command: str = "",
     **options: Unpack[DayOptions],

@@ -36,7 +36,7 @@ from iscat_analysis.optics.parameters import (
     with_settings,
 )
 from iscat_analysis.records import FloatArray
-from iscat_analysis.text import in_toml
+from iscat_analysis.text import brief, in_toml
 from iscat_analysis.units import count
 
 
@@ -127,6 +127,8 @@ class OpticsCalibration:
     images: int
     source: Mapping[str, str]
     notes: tuple[Finding, ...]
+
+    __repr__ = brief
 
     @property
     def accepted(self) -> bool:

@@ -41,6 +41,7 @@ from iscat_analysis.records import (
     Status,
 )
 from iscat_analysis.search.templates import Templates, make_templates, signal_to_noise
+from iscat_analysis.text import brief
 from iscat_analysis.threads import threads
 
 SATURATION_NM = 500.0
@@ -398,6 +399,8 @@ class LogLikelihood:
     detected_above: float
     _likelihood: Likelihood
     _fixed: FloatArray
+
+    __repr__ = brief
 
     def __call__(self, theta: ArrayLike) -> FloatArray:
         """Log-likelihood.

@@ -40,12 +40,14 @@ from iscat_analysis.instrument.learning import learn_optics, learn_sign, wrong_s
 from iscat_analysis.movie import Stack, open_stack, path_beside
 from iscat_analysis.pipeline.finish import make_analysis
 from iscat_analysis.pipeline.kinds import kind_of
-from iscat_analysis.records import Analysis, Progress, silent
+from iscat_analysis.progress import automatic, told
+from iscat_analysis.records import Analysis, Progress
 from iscat_analysis.report import write_report
 from iscat_analysis.report.output import check_output, claim_output
 from iscat_analysis.threads import start_in_thread
 
 
+@told
 def fit_stack(
     stack: str | Path,
     config: Config,
@@ -53,7 +55,7 @@ def fit_stack(
     out: Path | None = None,
     overwrite: bool = False,
     figures: bool = False,
-    progress: Progress = silent,
+    progress: Progress = automatic,
     notify: Notify = notify_nobody,
     command: str = "",
     inject: int = 0,
@@ -74,7 +76,7 @@ def fit_stack(
     figures : bool
         Draw figures for papers into its folder ``figures``.
     progress : Progress
-        Told how far each stage is.
+        Told how far each stage is; default as for `iscat_analysis.fit_movie`.
     notify : callable
         Told what the user should know, one line at a time.
     command : str

@@ -21,6 +21,7 @@ from iscat_analysis.fitting.ranges import background_mode
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.records import EventView, FloatArray
+from iscat_analysis.text import brief
 
 if TYPE_CHECKING:
     from iscat_analysis.pipeline.stored import StoredResult
@@ -60,6 +61,8 @@ class Look:
     image: FloatArray
     threshold: float
     search: Callable[[float], pd.DataFrame]
+
+    __repr__ = brief
 
     def found(self, threshold: float | None = None) -> pd.DataFrame:
         """Give what exceeds a threshold.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.config import MODES, SCHEMES, ModeKind, SchemeKind
 from iscat_analysis.findings import Finding, warnings_in
+from iscat_analysis.text import brief
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -500,6 +501,8 @@ class PosteriorResult:
     message: str
     van_trees: FloatArray | None = None
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True)
 class Trace:
@@ -536,6 +539,8 @@ class Trace:
     before: float
     after: float
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True)
 class Clip:
@@ -554,6 +559,8 @@ class Clip:
     frames: tuple[int, ...]
     window_frames: int
     contrast: NDArray[np.float32]
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True)
@@ -590,6 +597,8 @@ class EventView:
     trace: Trace | None = None
     clip: Clip | None = None
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True)
 class Film:
@@ -613,6 +622,8 @@ class Film:
     contrast: FloatArray
     model: FloatArray
     residual: FloatArray
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True)
@@ -696,6 +707,8 @@ class Analysis:
     tracks: pd.DataFrame | None = None
     films: tuple[Film, ...] = ()
     response: pd.DataFrame | None = None
+
+    __repr__ = brief
 
     @property
     def mode_kind(self) -> ModeKind:

@@ -23,6 +23,7 @@ from iscat_analysis.species.events import Efficiency, Events, possible
 from iscat_analysis.species.maximum import ENDS_95, TWO_SIDED_95
 from iscat_analysis.species.mixture import Mixture
 from iscat_analysis.species.repeats import Possible, Repeat, bootstrap, ratio_of_doubt, with_edges
+from iscat_analysis.text import brief
 from iscat_analysis.units import count
 
 Branch = Literal["magnitude", "landing", "leaving"]
@@ -109,6 +110,8 @@ class Distribution:
     seed: int
     findings: tuple[Finding, ...] = ()
     ladder: LadderFit | None = None
+
+    __repr__ = brief
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle
 from iscat_analysis.records import FloatArray
+from iscat_analysis.text import brief
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +57,8 @@ class EstimatorSetup:
     z_range_nm: tuple[float, float]
     level_fitted: bool
     start: FloatArray
+
+    __repr__ = brief
 
     def image(self, before: FloatArray, after: FloatArray) -> FloatArray:
         """Give the contrast; in dark field, the photoelectrons per frame above the background.
