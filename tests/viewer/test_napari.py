@@ -190,8 +190,11 @@ def test_tracks_are_those_of_the_exporter(viewer, tmp_path) -> None:
     described = describe_tracks(fits, SETUP)
     described.to_parquet(out / "tracks.parquet", index=False)
     (out / "config.toml").write_text('[fit]\nmode = "track"\n', encoding="utf-8")
-    about = {"mode": "track", "input": {"path": "gone.tif", "sha256": ""}}
-    (out / "summary.json").write_text(json.dumps(about | {"versions": {}, "seed": 0, "findings": []}))
+    about = {
+        "mode": "track", "input": {"path": "gone.tif", "sha256": ""}, "versions": {}, "seed": 0,
+        "findings": [],
+    }  # fmt: skip
+    (out / "summary.json").write_text(json.dumps(about), encoding="utf-8")
     tracks, points = viewer.open(str(out), plugin=PLUGIN)
     np.testing.assert_array_equal(tracks.data, ia.to_napari(fits))
     masses = described.set_index("track")["mass_kda"].loc[tracks.data[:, 0].astype(int)]
