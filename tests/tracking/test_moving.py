@@ -544,7 +544,7 @@ def _along_paths(
 
     At time t of the exposure, in units of it, a path lies about its mean with the variance
     6 q (1/3 − t + t²), the same before and after the middle: the second half stands for both.
-    Gauss–Hermite points along both axes: a sixth moves no picture by 1e-7 of its peak.
+    Gauss–Hermite points along both axes: five are right to 4e-7 of the peak.
     """
     points, weights = np.polynomial.hermite_e.hermegauss(5)
     weights = weights / weights.sum()
