@@ -346,23 +346,27 @@ def test_a_landing_movie_shows_its_noise_curve(browser: Any, pages: dict[str, Pa
         assert said in text
 
 
-def test_the_filter_narrows_the_table_and_clears(browser: Any, pages: dict[str, Path]) -> None:
+FILTER = """
+const [text, done] = arguments, input = document.getElementById("filter");
+input.value = text;
+input.dispatchEvent(new Event("input"));
+requestAnimationFrame(() => requestAnimationFrame(() =>
+  done(document.getElementById("count").textContent)));
+"""
+
+
+def test_the_filter_marks_what_it_finds_and_clears(browser: Any, pages: dict[str, Path]) -> None:
     show(browser, pages["mass"])
-    set_value = (
-        "const n = document.getElementById('filter'); n.value = arguments[0];"
-        "n.dispatchEvent(new Event('input'));"
-    )
-    count = "return document.getElementById('count').textContent"
     rows = browser.execute_script("return iscat.held.rows")
-    browser.execute_script(set_value, "poor_fit")
+    said = browser.execute_async_script(FILTER, "poor_fit")
     kept = first_cells(browser, column(browser, "status"))
     assert kept
     assert all(text.startswith("poor_fit") for text in kept)
-    assert browser.execute_script(count) == f"· {len(kept)} of {rows}"
-    browser.execute_script(set_value, "no such flag")
-    assert browser.execute_script(count) == f"· 0 of {rows}"
-    browser.execute_script(set_value, "")
-    assert browser.execute_script(count) == f"· {rows}"
+    assert said == f"· {len(kept)} of {rows}"
+    marked = "return iscat.rows('events').filter((e) => e.marked).length"
+    assert browser.execute_script(marked) == len(kept)
+    assert browser.execute_async_script(FILTER, "no such flag") == f"· 0 of {rows}"
+    assert browser.execute_async_script(FILTER, "") == f"· {rows}"
 
 
 MARK = """
@@ -567,10 +571,7 @@ def test_ten_thousand_particles_are_shown_in_pages(browser: Any, tmp_path: Path)
     assert len(first_cells(browser, 0)) == 50
     click(browser, "[data-page='1']")
     assert first_cells(browser, 0)[0] == "50"
-    browser.execute_script(
-        "const f = document.getElementById('filter'); f.value = '9999';"
-        "f.dispatchEvent(new Event('input'))"
-    )
+    browser.execute_async_script(FILTER, "9999")
     assert "9999" in first_cells(browser, 0)
     assert not errors(browser)
 

@@ -103,7 +103,7 @@
     if (id === "mobility") watch(view, "region", { value: "value", d: "d" });
     if (figuresOfEvents.includes(id)) view.addEventListener("click", (_, item) => { if (item?.datum?.row !== undefined) open(item.datum.row); });
   });
-  byId("clear").addEventListener("click", () => mark(null));
+  byId("clear").addEventListener("click", () => { byId("filter").value = ""; mark(null); });
   document.querySelectorAll("tr[data-species]").forEach((line) => {
     const pick = () => mark((event) => event.species === +line.dataset.species);
     line.addEventListener("click", pick);
@@ -123,8 +123,7 @@
   const columns = held.table.map((column) => (column.of ? { ...column, cells: events.map((event) => String(event[column.of])) } : column));
   let kept = order;
   const fill = () => {
-    const asked = filter.value.trim();
-    kept = order.filter((k) => (!marked || marked.has(k)) && (!asked || columns.some((column) => column.cells[k].includes(asked))));
+    kept = order.filter((k) => !marked || marked.has(k));
     page = Math.max(0, Math.min(page, Math.ceil(kept.length / size) - 1));
     body.replaceChildren(...kept.slice(page * size, (page + 1) * size).map((k) => {
       const line = made("tr", { id: `row-${k}`, className: [k === opened && "hit", rejected.has(events[k].event) && "off"].filter(Boolean).join(" ") });
@@ -145,7 +144,11 @@
     document.querySelectorAll("[data-page]").forEach((button) => { button.hidden = pages < 2; });
   };
   document.querySelectorAll("[data-page]").forEach((button) => button.addEventListener("click", () => { page += +button.dataset.page; fill(); }));
-  filter.addEventListener("input", () => { page = 0; fill(); });
+  filter.addEventListener("input", () => {
+    const asked = filter.value.trim();
+    page = 0;
+    mark(asked ? (event) => columns.some((column) => column.cells[event.row].includes(asked)) : null);
+  });
   [...table.tHead.rows[0].cells].forEach((head, n) => head.firstElementChild.addEventListener("click", () => {
     const down = head.getAttribute("aria-sort") === "ascending" ? -1 : 1;
     table.querySelectorAll("th").forEach((th) => th.setAttribute("aria-sort", "none"));
