@@ -26,6 +26,7 @@ from iscat_analysis.movie.tables import read_frame, refuse_twice
 from iscat_analysis.options import BindingOptions, EventOptions, only, takes
 from iscat_analysis.reading import is_file, is_folder, read_json
 from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.report.plots import Panels, plot_kd
 from iscat_analysis.report.species import binding_figure
 from iscat_analysis.schemas import jsonable
 from iscat_analysis.species import LEAST_EVENTS
@@ -99,6 +100,26 @@ class Binding:
             "profile": profile,
             "notes": list(self.notes),
         }
+
+    def plot_kd(self, *, ax: Any = None) -> Panels:
+        """Draw fractions of complexes with their intervals and the equilibrium, and the likelihood.
+
+        Parameters
+        ----------
+        ax : Axes or sequence of Axes, optional
+            Two, or one for the fractions alone; default a figure that shows itself in a notebook.
+
+        Returns
+        -------
+        ndarray of matplotlib.axes.Axes
+            What was drawn into.
+
+        Raises
+        ------
+        ConfigError
+            The number of axes is another one.
+        """
+        return plot_kd(jsonable(self.to_dict()), ax=ax)
 
 
 @takes(BindingOptions)

@@ -532,7 +532,7 @@ class StoredResult(MovieResult):
         except (OSError, ValueError) as error:
             raise DataError(f"{folder}: cannot be read as a result ({error})") from None
         self.config: Config = load_config(folder / "config.toml")
-        about = summary["input"], summary["versions"], summary["seed"]
+        source, versions, seed = summary["input"], summary.get("versions", {}), summary.get("seed")
         nothing = np.zeros(0)
         self.analysis = Analysis(
             config_toml=(folder / "config.toml").read_text(encoding="utf-8"),
@@ -545,7 +545,7 @@ class StoredResult(MovieResult):
             power=nothing,
             power_frames=nothing.astype(np.int64),
             summary=summary,
-            provenance=Provenance("", about[0]["path"], about[0]["sha256"], *about[1:], ""),
+            provenance=Provenance("", source["path"], source["sha256"], versions, seed, ""),
             findings=tuple(_findings(summary)),
             tracks=tracks,
         )
@@ -659,7 +659,7 @@ class StoredResult(MovieResult):
 
 def _findings(summary: Mapping[str, Any]) -> Iterator[Finding]:
     """Make the findings of a summary again, as far as this version knows their codes."""
-    for found in summary["findings"]:
+    for found in summary.get("findings", ()):  # earlier versions had none
         kind, values = KINDS.get(found["code"]), found["values"]
         if kind is not None and kind.names <= values.keys():
             frames = found["frames"] and (int(found["frames"][0]), int(found["frames"][1]))

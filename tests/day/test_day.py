@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jsonschema
@@ -28,6 +29,8 @@ from iscat_analysis.day.jobs import STATE, Records
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.schemas import schema, to_json
 from iscat_cli import main
+from iscat_cli.console import print_result
+from iscat_cli.day import _lines as printed_lines
 
 pytestmark = pytest.mark.usefixtures("all_sketched")
 
@@ -123,6 +126,47 @@ def test_the_schema_names_the_columns_of_the_tables() -> None:
     assert tuple(parts["DaySpecies"]["properties"]) == SPECIES_COLUMNS
     assert set(parts["DayMovie"]["properties"]) == set(MOVIE_COLUMNS)
     assert tuple(parts["DayKd"]["properties"]) == KD_COLUMNS
+
+
+def test_all_species_of_a_movie_are_printed(capsys) -> None:
+    """Control: species of a movie without a scale of masses are contrasts, and none is in kDa."""
+    states = {
+        "sample": "s",
+        "events": 27,
+        "landings": 20,
+        "state": "done",
+        "why": "",
+        "cautions": "",
+    }
+    movies = pd.DataFrame(
+        [
+            {"movie": "a", "answer": "Species of mass 67.1 · 148 kDa", **states},
+            {"movie": "b", "answer": "Species of contrast 0.0021 · 0.0046", **states},
+        ]
+    )
+    rows = [
+        {
+            "movie": movie,
+            "mass_kda": mass,
+            "mass_low": mass - 4,
+            "mass_high": mass + 4,
+            "count": 9.0,
+        }
+        | {"share": 0.4, "outlier": mass == 9.0}
+        for movie in "ab"
+        for mass in (9.0, 67.1, 148.0)
+    ]
+    found = SimpleNamespace(
+        movies=movies, species=pd.DataFrame(rows), kd=pd.DataFrame({"why": []}), analysed=(),
+        out=Path("day"), page=Path("day/batch.html"),
+    )  # fmt: skip
+    for line in printed_lines(found):
+        print_result(line)
+    said = capsys.readouterr().out
+    assert "67.1 kDa (63.1 to 71.1): 9, 40 %" in said
+    assert "148 kDa (144 to 152): 9, 40 %" in said
+    assert "Species of contrast 0.0021 · 0.0046" in said
+    assert said.count("kDa (") == 2
 
 
 def test_a_batch_is_printed_as_one_object(done: Path, capsys, tmp_path: Path) -> None:

@@ -155,3 +155,19 @@ def test_a_report_has_figures_only_where_they_are_wanted(tmp_path: Path) -> None
     assert not (plain / "figures").exists()
     assert (drawn / "figures" / "masses.png").is_file()
     assert (drawn / "figures" / "masses.svg").is_file()
+
+
+def test_an_equilibrium_is_drawn_into_one_or_two_axes() -> None:
+    profile = {"ln_kd_nm": [1.0, 2.0, 3.0], "deviance": [4.0, 0.0, 5.0]}
+    rows = [
+        {"concentration_nm": c, "complexes": s, "complexes_low": s - 0.1, "complexes_high": s + 0.1}
+        for c, s in ((5.0, 0.2), (50.0, 0.6))
+    ]
+    found = {"model": "dimer", "samples": rows, "profile": profile, "kd_nm": 7.4, "kd_low": 3.0}
+    found |= {"kd_high": 15.0, "curve": {"concentration_nm": [5, 50], "complexes": [0.2, 0.6]}}
+    whole = plots.plot_kd(found)
+    assert [axes.get_xlabel() for axes in whole] == ["monomers in all [nM]", "$K_D$ [nM]"]
+    assert whole[1].get_title("left") == "$K_D$ = 7.40 nM"
+    own = Figure().add_subplot()
+    (only,) = plots.plot_kd(found, ax=own)
+    assert only is own
