@@ -76,6 +76,8 @@ RINGS = ((200, 240), (1000, 90), (math.inf, 20))
 """Sizes of rings around so many particles at most, so that the field is seen between them."""
 MOST_ERRORS = 400
 """Tracks whose errors are drawn beside their dots."""
+FEWEST_BINS = 9
+"""Bins on the axis of a histogram, of which most are empty where particles are few or alike."""
 MOST_LINE_POINTS = 1000
 """Points of a line over the movie."""
 MOST_DOTS = 300
@@ -408,11 +410,18 @@ def masses(sample: Sample) -> VegaFigure:
         "title": sample.quantity.label.capitalize(),
         "counted": f"{sample.kind.noun}s",
         "bin": wide,
+        "span": _around(bars["low"].min(), bars["high"].max(), wide),
     }
     data = {name: columns_of(v) for name, v in (("bars", bars), ("curves", curves))}
     data["peaks"] = columns_of(peaks)
     drawn = figure("masses", data, {**sample.words, **words})
     return described(drawn, _sentence(sample))
+
+
+def _around(low: float, high: float, wide: float) -> list[float]:
+    """Choose an axis of a few bins at least, with one to spare at each end."""
+    beside = wide * max(1, round((FEWEST_BINS - (high - low) / wide) / 2))
+    return [low - beside, high + beside]
 
 
 def _sentence(sample: Sample) -> str:
