@@ -17,7 +17,7 @@ from bokeh.plotting import figure
 import iscat_analysis as ia
 from iscat_analysis.answers.binding import CONCENTRATIONS
 from iscat_analysis.answers.gates import MassHistogram, counted_events, counted_rows, mass_histogram
-from iscat_analysis.report.species import PALETTES
+from iscat_analysis.report.style import PALETTES
 from iscat_analysis.species.equilibrium import Model
 from iscat_analysis.species.tables import EventTable
 from iscat_app import widgets as ui

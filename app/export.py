@@ -16,7 +16,7 @@ import iscat_analysis as ia
 from iscat_analysis.answers.gates import gate_rows
 from iscat_analysis.config import config_to_toml
 from iscat_analysis.movie import path_beside
-from iscat_analysis.report.species import FONTS, PALETTES, Format, figure_bytes, histogram_figure
+from iscat_analysis.report.style import FONTS, PALETTES, Format, figure_bytes, histogram_figure
 from iscat_app.chosen import Chosen, Notice
 from iscat_app.compare import Compare
 from iscat_app.results import Results

@@ -86,7 +86,7 @@ def species(
     if rates is not None:
         values["kinetics"] = rates.to_dict()
     lines = [*_lines(found), *_rate_lines(rates)]
-    messages.answer("species", values, lines, output.out, "figures/species.png", notes=notes)
+    messages.answer("species", values, lines, output.out, "species.html", notes=notes)
 
 
 def _refuse_single(options: SpeciesOptions, *, rates: bool) -> None:
@@ -115,7 +115,7 @@ def _compare(messages: Messages, events: list[Path], output: Output, options: An
     values = comparison_document(names[0], names[1:], found, notes)
     pairs = zip(names[1:], found, strict=True)
     lines = [line for name, one in pairs for line in _comparison_lines(name, names[0], one)]
-    page = "figures/comparison.png"
+    page = "comparison.html"
     messages.answer("species_comparison", values, lines, output.out, page, notes=notes)
 
 
@@ -231,7 +231,7 @@ def kd(
         dimer: 2 M = D with concentration_nm of monomers in all; ab: A + B = AB with a_nm and b_nm
         in all.
     --out DIR
-        Folder for kd.csv, kd.json and a figure.
+        Folder for kd.csv, kd.json and kd.html.
 
     Example: series.csv has a row per table, columns path and concentration_nm.
 
@@ -241,7 +241,7 @@ def kd(
 
     found = fit_kd(samples, model=model, **options, out=output.out, overwrite=output.overwrite)
     values = {"source": str(samples), **found.to_dict()}
-    lines, page = _binding_lines(found), "figures/kd.png"
+    lines, page = _binding_lines(found), "kd.html"
     messages.answer("kd", values, lines, output.out, page, notes=found.notes)
 
 

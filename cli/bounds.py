@@ -164,7 +164,7 @@ def bounds(messages: Messages, *, asked: Question, setup: ModeSetup, output: Out
         messages.report(OFFSET_LEFT_OUT())
     if output.out is not None:
         write_bounds(report, output.out, overwrite=output.overwrite, **along)
-        messages.wrote(output.out)
+        messages.wrote(output.out, "bounds.html")
     messages.show("bounds", report, _lines(report))
 
 
@@ -232,7 +232,7 @@ def _optics(messages: Messages, config: Config, asked: Question, output: Output)
     messages.note(*(f"warning: {line}" for line in report["warnings"]))
     if output.out is not None:
         write_optics_bounds(report, output.out, overwrite=output.overwrite)
-        messages.wrote(output.out)
+        messages.wrote(output.out, "bounds.html")
     messages.show("optics_bounds", report, _optics_lines(report))
 
 

@@ -66,7 +66,7 @@ def batch(
     """Analyse the movies of a day and set them side by side.
 
     Flats give the camera and calibrants the optics and the mass scale of all other movies. Writes
-    batch.html, movies.csv, species.csv, shifts.csv, events.parquet and figures to the folder, with
+    batch.html, movies.csv, species.csv, shifts.csv and events.parquet to the folder, with
     the result of each movie in movies. What is finished and has not changed is left alone.
 
     Options

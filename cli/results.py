@@ -62,7 +62,8 @@ def view(result: Path) -> None:
     Options
     -------
     DIR
-        Output folder of fit, batch, calibrate or benchmark; or a movie that has one beside it.
+        Output folder of fit, batch, calibrate, species, kd, bounds or benchmark; or a movie that
+        has one beside it.
 
     Example: the report of a movie, in the browser.
 

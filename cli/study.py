@@ -152,7 +152,7 @@ def benchmark(
     """Measure spread, bias and coverage of the fits against CRB and QCRB.
 
     Draws synthetic shot noise, fits it in modes mass, localize and joint, of spheres in modes size
-    and localize, and writes benchmark.json, benchmark.html and figures to the output folder. With
+    and localize, and writes benchmark.json and benchmark.html to the output folder. With
     --estimator, others see the same counts; each runs in a process of its own.
 
     Options

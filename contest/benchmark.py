@@ -164,15 +164,13 @@ def run_benchmark(
 
 
 def write_benchmark(study: Mapping[str, Any], folder: Path, *, overwrite: bool = False) -> Path:
-    """Write ``benchmark.json``, its page, ``benchmark.bib``, ``config.toml`` and ``figures/``."""
+    """Write ``benchmark.json``, its page, ``benchmark.bib`` and ``config.toml``."""
     with atomic_folder(folder, overwrite, known=BENCHMARK_NAMES) as building:
         text = to_json("benchmark", study)
         (building / "benchmark.json").write_text(text + "\n", encoding="utf-8")
         (building / "config.toml").write_text(study["config"], encoding="utf-8")
         (building / "benchmark.bib").write_text(bibtex("Benchmark", text), encoding="utf-8")
-        (building / "figures").mkdir()
-        page = render_benchmark(study, folder=building / "figures")
-        (building / "benchmark.html").write_text(page, encoding="utf-8")
+        (building / "benchmark.html").write_text(render_benchmark(study), encoding="utf-8")
     return folder
 
 

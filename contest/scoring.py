@@ -1,6 +1,6 @@
 """Score results of any program and estimators that are run, and write the scores.
 
-A folder of scores can be cited: JSON, page, figures, BibTeX, and an archive.
+A folder of scores can be cited: JSON, page, BibTeX, and an archive.
 """
 
 from __future__ import annotations
@@ -399,13 +399,11 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest that an archive can name: no date
 
 
 def write_scores(document: Mapping[str, Any], folder: Path, *, overwrite: bool = False) -> Path:
-    """Write ``challenge.json``, ``challenge.html``, ``benchmark.bib`` and ``figures/``."""
+    """Write ``challenge.json``, ``challenge.html`` and ``benchmark.bib``."""
     with atomic_folder(folder, overwrite, known=CHALLENGE_NAMES) as building:
         text = to_json("challenge", document) + "\n"
         (building / "challenge.json").write_text(text, encoding="utf-8")
-        (building / "figures").mkdir()
-        page = render_challenge(document, folder=building / "figures")
-        (building / "challenge.html").write_text(page, encoding="utf-8")
+        (building / "challenge.html").write_text(render_challenge(document), encoding="utf-8")
         (building / "benchmark.bib").write_text(bibtex(document["title"], text), encoding="utf-8")
     return folder
 

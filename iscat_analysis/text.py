@@ -1,6 +1,6 @@
 """Text from outside, such as names of files and samples, made harmless where it is shown.
 
-A name may hold characters that a terminal, a spreadsheet, Matplotlib or XML would act on.  For each
+A name may hold characters that a terminal, a spreadsheet or XML would act on.  For each
 place where text is shown there is one function.
 """
 
@@ -39,15 +39,6 @@ def in_terminal(text: str) -> str:
 def in_page(text: str) -> str:
     """Do the same in HTML or XML, whose own signs are escaped where a text is put in."""
     return in_terminal(text)
-
-
-def in_figure(text: str) -> str:
-    """Write a text as one line of letters: no dollar begins a formula of Matplotlib's.
-
-    Matplotlib would leave a label that begins with an underscore out of its legend.
-    """
-    shown = in_terminal(re.sub(r"[\t\n]", " ", text)).replace("$", r"\$")
-    return f" {shown}" if shown.startswith("_") else shown
 
 
 def in_json(document: str) -> str:

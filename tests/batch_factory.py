@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from iscat_analysis.day.gather import MOVIE_COLUMNS, SPECIES_COLUMNS
 from iscat_analysis.report.batch import BatchContents, Curve, batch_page, summary_line
 
 
-def make_batch_page(number: int, *, replicates: int = 3, folder: Path | None = None) -> str:
+def make_batch_page(number: int, *, replicates: int = 3) -> str:
     """Make the page of a dimer's concentration series: so many movies, the last of which failed."""
     rng = np.random.default_rng(number)
     movies: list[dict[str, Any]] = []
@@ -77,4 +76,4 @@ def make_batch_page(number: int, *, replicates: int = 3, folder: Path | None = N
         equilibria=(),
         mass_label="mass [kDa]",
     )
-    return batch_page("samples", summary_line(table), contents, folder)
+    return batch_page("samples", summary_line(table), contents)

@@ -27,7 +27,7 @@ from iscat_analysis.options import BindingOptions, EventOptions, only, takes
 from iscat_analysis.reading import is_file, is_folder, read_json
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.report.plots import Panels, plot_kd
-from iscat_analysis.report.species import binding_figure
+from iscat_analysis.report.species import binding_page
 from iscat_analysis.schemas import jsonable
 from iscat_analysis.species import LEAST_EVENTS
 from iscat_analysis.species.describe import LEAST_EFFICIENCY
@@ -149,7 +149,7 @@ def fit_kd(
     tables : sequence of EventTable or pandas.DataFrame, optional
         The tables of all rows themselves, in place of ``path``.
     out : str or Path, optional
-        Folder for kd.csv, kd.json and a figure.
+        Folder for kd.csv, kd.json and a page, kd.html.
     overwrite : bool
         Replace an earlier result in `out`.
     notify : callable, optional
@@ -184,7 +184,7 @@ def fit_kd(
     True
     """
     _check(model, options)
-    folder = folder_for(out, "kd.csv", "kd.json", "figures", overwrite=overwrite)
+    folder = folder_for(out, "kd.csv", "kd.json", "kd.html", overwrite=overwrite)
     name = "samples" if isinstance(samples, pd.DataFrame) else str(samples)
     rows, totals, found, findings = _series(samples, name, model, tables, options)
     masses, about = _masses(found, model, options["masses_kda"])
@@ -202,7 +202,7 @@ def fit_kd(
     tell(notes, notify)
     contents = {"source": name, **result.to_dict()}
     files = {"kd.csv": in_table(result.samples), "kd.json": ("kd", contents)}
-    folder.write(files, lambda: binding_figure(jsonable(contents)))
+    folder.write({**files, "kd.html": lambda: binding_page(jsonable(contents))})
     return result
 
 

@@ -23,7 +23,7 @@ from iscat_analysis.options import (
     takes,
 )
 from iscat_analysis.records import FloatArray, Progress, silent
-from iscat_analysis.report.species import comparison_figure
+from iscat_analysis.report.species import comparison_page
 from iscat_analysis.schemas import jsonable
 from iscat_analysis.species import LEAST_EVENTS, Comparison
 from iscat_analysis.species.comparison import compare
@@ -99,7 +99,7 @@ def compare_tables(
     workers : int, optional
         Threads; default as many as there are processors.
     out : str or Path, optional
-        Folder for comparison.csv, comparison.json and a figure.
+        Folder for comparison.csv, comparison.json and a page, comparison.html.
     overwrite : bool
         Replace an earlier result in `out`.
     progress : Progress
@@ -125,7 +125,7 @@ def compare_tables(
     The species are chosen once, on events of all tables, at most `_MOST_POOLED` evenly from each.
     """
     choice = choice_of(defaults(SpeciesOptions) | options)
-    names = ("comparison.csv", "comparison.json", "figures")
+    names = ("comparison.csv", "comparison.json", "comparison.html")
     folder = folder_for(out, *names, overwrite=overwrite)
     if workers is not None:
         workers = int(number_in("`workers`", workers, least=1, most=1024, whole=True))
@@ -154,8 +154,9 @@ def compare_tables(
     files = {
         "comparison.csv": in_table(comparison_rows(contents)),
         "comparison.json": ("species_comparison", contents),
+        "comparison.html": lambda: comparison_page(jsonable(contents), _histograms(read)),
     }
-    folder.write(files, lambda: comparison_figure(jsonable(contents), _histograms(read)))
+    folder.write(files)
     return found
 
 

@@ -10,12 +10,10 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 import pandas as pd
 import tifffile
-from matplotlib.figure import Figure
 
 from iscat_analysis.inference.checks import path_in
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.report import atomic_folder, check_output
-from iscat_analysis.report.style import publish
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.schemas import to_json
 
@@ -40,21 +38,18 @@ class AnswerFolder:
     progress: Progress = silent
     notify: Notify | None = None
 
-    def write(
-        self,
-        files: Mapping[str, Any],
-        figures: Callable[[], Iterable[tuple[str, Figure]]] | None = None,
-    ) -> None:
+    def write(self, files: Mapping[str, Any]) -> None:
         """Write all files of an answer, or none.
 
         A table becomes CSV, an array TIFF, a document with the name of its schema JSON; text and
-        bytes stay as they are, and what is None is left out.
+        bytes stay as they are, what is None is left out, and a function makes the content.
         """
         if self.path is None:
             return
         with atomic_folder(self.path, self.overwrite, known=self.known) as building:
             for name, content in files.items():
                 path = building / name
+                content = content() if callable(content) else content
                 if isinstance(content, pd.DataFrame):
                     content.to_csv(path, index=False, float_format=f"%.{CSV_DIGITS}g")
                 elif isinstance(content, np.ndarray):
@@ -63,9 +58,6 @@ class AnswerFolder:
                     path.write_text(to_json(*content) + "\n", encoding="utf-8")
                 elif content is not None:
                     path.write_bytes(content if isinstance(content, bytes) else content.encode())
-            if figures is not None:
-                (building / "figures").mkdir()
-                publish(figures(), building / "figures")
 
 
 def folder_for(out: str | Path | None, *known: str, **writing: Unpack[Writing]) -> AnswerFolder:

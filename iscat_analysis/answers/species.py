@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -15,8 +14,7 @@ from iscat_analysis.answers.output import AnswerFolder, Notify, folder_for, tell
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import choice_in, number_in, shown, truth_in
 from iscat_analysis.options import EventOptions, SpeciesOptions, only, takes
-from iscat_analysis.report.species import species_figure
-from iscat_analysis.report.style import drawn
+from iscat_analysis.report.species import species_page
 from iscat_analysis.schemas import jsonable
 from iscat_analysis.species import LEAST_EVENTS, Distribution, choices, describe
 from iscat_analysis.species.tables import EventTable, event_table, mass_in, refuse_far, sentences
@@ -52,7 +50,7 @@ def find_species(
     seed : int
         Of the repetitions.
     out : str or Path, optional
-        Folder for species.csv, species.json and a figure.
+        Folder for species.csv, species.json and a page, species.html.
     overwrite : bool
         Replace an earlier result in `out`.
     notify : callable, optional
@@ -86,7 +84,7 @@ def find_species(
     seed = int(number_in("`seed`", seed, least=0, whole=True))
     if kinetics is not None and not isinstance(kinetics, Kinetics):
         raise ConfigError(f"`kinetics` = {shown(kinetics)}: give what `fit_kinetics` returns")
-    names = ("species.csv", "species.json", "figures")
+    names = ("species.csv", "species.json", "species.html")
     folder = folder_for(out, *names, overwrite=overwrite, notify=notify)
     table = event_table(events, **only(EventOptions, options))
     _refuse_impossible(table, choice)
@@ -114,9 +112,8 @@ def _write(
     contents = {"source": table.name, **found.to_dict(), "notes": notes}
     if kinetics is not None:
         contents["kinetics"] = kinetics.to_dict()
-    sketch = ("species", partial(species_figure, jsonable(contents)))
     files = {"species.csv": found.species, "species.json": ("species", contents)}
-    folder.write(files, lambda: drawn([sketch]))
+    folder.write({**files, "species.html": lambda: species_page(jsonable(contents))})
 
 
 def _refuse_impossible(table: EventTable, choice: choices.Choice) -> None:

@@ -8,7 +8,6 @@ grows.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -45,7 +44,6 @@ from iscat_analysis.options import DayOptions, takes
 from iscat_analysis.progress import automatic, told
 from iscat_analysis.records import Progress
 from iscat_analysis.report.batch import BatchContents, Curve, batch_page, summary_line
-from iscat_analysis.report.output import atomic_folder
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.text import brief, from_table, in_table
 from iscat_analysis.units import count
@@ -317,9 +315,6 @@ def _read(path: Path, text: Mapping[str, type[str]]) -> pd.DataFrame:
     return from_table(pd.read_csv(path, dtype=text, keep_default_na=False, na_values=[""]))
 
 
-_FIGURE = re.compile(r"(overlaid|stacked(_\d+)?|species|shares|rates|kd(_\d+)?)\.(png|svg|pdf)")
-
-
 def publish_day(
     day: Day,
     found: Sequence[Found],
@@ -342,19 +337,12 @@ def publish_day(
             index=False, float_format=f"%.{CSV_DIGITS}g", lineterminator="\n"
         )
         write_whole(out / f"{name}.csv", text)
-    with atomic_folder(out / "figures", True, known=_figure_files(out / "figures")) as folder:
-        contents = _contents(day, found, tables, series, failed)
-        page = batch_page(day.plan.table.title, summary_line(movies), contents, folder)
+    contents = _contents(day, found, tables, series, failed)
+    page = batch_page(day.plan.table.title, summary_line(movies), contents)
     write_whole(out / "batch.html", page)
     own = movies[list(movies.columns[len(MOVIE_COLUMNS) :])]
     with whole_file(out / "events.parquet") as partial:
         gather.write_events(found, own, partial)
-
-
-def _figure_files(folder: Path) -> set[str]:
-    """Name what an earlier batch may have left among the figures."""
-    held = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    return {name for name in held if _FIGURE.fullmatch(name)}
 
 
 def _contents(

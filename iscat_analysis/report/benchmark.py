@@ -8,16 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
-from itertools import chain
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Rectangle
 
 from iscat_analysis.config import SCHEMES
 from iscat_analysis.records import PARAMETERS
@@ -35,22 +28,16 @@ from iscat_analysis.report.numbers import (
     tabulate,
     worded,
 )
-from iscat_analysis.report.page import Chart, Section, render_document
-from iscat_analysis.report.style import (
-    BLUE,
-    GREY,
-    INK,
-    VERMILLION,
-    Style,
-    floats,
-    legend,
-    new_figure,
-    one_panel,
-    plain_log,
-    publish,
-    row_of_panels,
-    whiskers,
-    whole_numbers,
+from iscat_analysis.report.page import (
+    Chart,
+    Row,
+    Section,
+    curves,
+    heatmap,
+    interval,
+    intervals,
+    marks,
+    render_document,
 )
 
 ENOUGH_RANKS = 100
@@ -65,24 +52,17 @@ _TITLES = {
     "joint": "Joint: position in three dimensions and mass",
 }
 _BASELINES = {"gaussian": "Gaussian least squares", "peak": "peak contrast"}
-_FIGURES = {
-    "photons": "Spread against photons",
-    "heights": "Spread against height",
-    "pulls": "Pulls: (estimate − truth) / σ",
-    "ranks": "Ranks of the truth among the draws of its posterior",
-}
-_COLOURS = ("#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6A3D9A", "#8A8F96", "#B15928")
-_MARKERS = "os^Dv<>PXph*"
-_MAP_COLOURS = ("#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#F0E442", "#D55E00", "#8A8F96")
-
 _AXES = {
-    "photons": ("collected scattered photons", True),
-    "mass": ("mass [kDa]", True),
-    "height": ("height [nm]", False),
-    "focus": ("focus [nm]", False),
-    "density": ("other particles per µm²", True),
-    "wrong_focus": ("error of the focus that estimators are told [nm]", False),
+    "photons": ("collected scattered photons", "x"),
+    "mass": ("mass [kDa]", "x"),
+    "height": ("height [nm]", ""),
+    "focus": ("focus [nm]", ""),
+    "density": ("other particles per µm²", "x"),
+    "wrong_focus": ("error of the focus that estimators are told [nm]", ""),
 }
+
+_UNRANKED = ("below the bound", "does not follow the particle")
+"""How the verdicts begin of estimators that are not ranked."""
 
 _HOW = (
     "Every estimator was given the same counts, and a start up to a pixel off. Efficiency is the "
@@ -135,26 +115,16 @@ def _bias(row: Any) -> str:
     return known if known == "—" else f"{known} ± {number(row['bias_se'], 2)}"
 
 
-def _legend_below(figure: Figure) -> None:
-    legend(figure, where="lower center", columns=2 + 2 * len(figure.axes))
-
-
 # ---- A benchmark ---------------------------------------------------------------------------------
 
 
-def render_benchmark(study: Mapping[str, Any], *, folder: Path | None = None) -> str:
-    """Make the page of a study, and write its figures."""
-    others = "estimators" in study
-    figures = benchmark_figures(study)
-    if others:
-        named = {f"estimators-{mode}": part for mode, part in contest_parts(study).items()}
-        figures = chain(figures, contest_figures(study), part_figures(named))
-    drawn = publish(figures, folder)
+def render_benchmark(study: Mapping[str, Any]) -> str:
+    """Make the page of a study."""
     code = f"{study['command']}\n\n{study['config']}"
     sections = [
-        *(contest_sections(study, drawn) if others else ()),
+        *(contest_sections(study) if "estimators" in study else ()),
         _summary(study),
-        *(_mode_section(study, mode, drawn) for mode in MODES if mode in study),
+        *(_mode_section(study, mode) for mode in MODES if mode in study),
         Section(
             "how", "How this was measured", notes=_MEASURED, tables=[_versions(study)], code=code
         ),
@@ -173,7 +143,7 @@ def _summary(study: Mapping[str, Any]) -> Section:
     facts = []
     for mode in modes:
         entry, names = study[mode], _named(study[mode])
-        ratios = floats(entry[name]["spread_over_crb"] for name in names)
+        ratios = np.array([entry[name]["spread_over_crb"] for name in names], float)
         finite = ratios[np.isfinite(ratios)]
         named = ", ".join(LABELS[n] for n in names)
         note = f"over {named}; {entry['failed']} of {entry['trials']} fits failed"
@@ -204,14 +174,9 @@ def _summary(study: Mapping[str, Any]) -> Section:
     return Section("summary", "Summary", lead, facts, tables=[table])
 
 
-def _mode_section(study: Mapping[str, Any], mode: str, drawn: Mapping[str, Markup]) -> Section:
+def _mode_section(study: Mapping[str, Any], mode: str) -> Section:
     entry, at = study[mode], study[mode]["at"]
     rows = [{"name": name, **entry[name]} for name in _named(entry)]
-    charts = [
-        Chart(f"{mode}-{stem}", title, drawn[f"{stem}_{mode}"], wide=True)
-        for stem, title in _FIGURES.items()
-        if f"{stem}_{mode}" in drawn
-    ]
     flagged = [f"{n} {flag.replace('_', ' ')}" for flag, n in entry["flagged"].items() if n]
     diameter = at.get("diameter_nm")
     what = f"{at['mass_kda']:,.0f} kDa" if diameter is None else f"A sphere of {diameter:.4g} nm"
@@ -254,7 +219,7 @@ def _mode_section(study: Mapping[str, Any], mode: str, drawn: Mapping[str, Marku
         mode,
         _TITLES[mode],
         lead.replace("-", "−"),
-        charts=charts,
+        charts=list(mode_charts(study, mode)),
         tables=[
             tabulate(rows, achieved, "Achieved and possible"),
             tabulate(rows, covered, "Truths inside the stated intervals"),
@@ -263,76 +228,65 @@ def _mode_section(study: Mapping[str, Any], mode: str, drawn: Mapping[str, Marku
     )
 
 
-def benchmark_figures(study: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
-    """Draw the figures."""
-    for mode in (mode for mode in MODES if mode in study):
-        names = _named(study[mode])
-        for key, axis, stem in (("photons", "photons", "photons"), ("z", "height", "heights")):
-            curve = study["curves"][key][mode]
-            yield f"{stem}_{mode}", _panels(names, partial(_draw_curve, axis, curve))
-        for kind, draw in (("pulls", _draw_pulls), ("ranks", _draw_ranks)):
-            if bins := study["histograms"][kind][mode]:
-                yield f"{kind}_{mode}", _panels(names, partial(draw, bins))
+def mode_charts(study: Mapping[str, Any], mode: str) -> Iterator[Chart]:
+    """Show the spread along light and height, and the histograms of pulls and ranks."""
+    names = _named(study[mode])
+    of = f"-{mode}"
+    for key, stem in (("photons", "photons"), ("z", "heights")):
+        curve = study["curves"][key][mode]
+        fine = curve.get("bounds", curve)
+        parts = [
+            part
+            for name in names
+            for part in (
+                *_bounds(fine["at"], fine[name], parameter(name)),
+                _points("spread", curve["at"], curve[name], "spread", parameter(name)),
+            )
+        ]
+        yield curves(stem, parts, of=of)
+    if pulls := study["histograms"]["pulls"][mode]:
+        parts = []
+        for name in names:
+            bins, panel = pulls[name], parameter(name)
+            edges = np.asarray(bins["edges"], float)
+            parts.append(marks("bar", "fits", edges, bins["counts"], panel=panel))
+            middle = (edges[1:] + edges[:-1]) / 2
+            parts.append(marks("line", "normal", middle, bins["expected"], panel=panel))
+        yield curves("pulls", parts, of=of)
+    if ranks := study["histograms"]["ranks"][mode]:
+        parts = []
+        for name in names:
+            counts, most = np.asarray(ranks[name]["counts"], float), ranks[name]["possible"]
+            known = f", p = {ranks[name]['p_value']:.2g}" if counts.sum() >= ENOUGH_RANKS else ""
+            panel, edges = parameter(name) + known, np.linspace(0, most, counts.size + 1)
+            parts.append(marks("bar", "posteriors", edges, counts, panel=panel))
+            parts.append(marks("line", "uniform", [0, most], [counts.mean()] * 2, panel=panel))
+        yield curves("ranks", parts, of=of)
 
 
-def _panels(names: Sequence[str], draw: Callable[[Axes, str], None]) -> Figure:
-    figure, panels = row_of_panels(len(names), 2.9, 2.9)
-    for axes, name in zip(panels, names, strict=True):
-        draw(axes, name)
-        axes.set_title(parameter(name))
-        if axes is not panels[0]:
-            axes.set_ylabel("")
-    legend(figure)
-    return figure
+def _bounds(at: Any, bounds: Mapping[str, Any], panel: str) -> Iterator[list[Row]]:
+    """Make the lines of both bounds."""
+    yield marks("line", "CRB", at, bounds["crb"], panel=panel)
+    yield marks("line", "QCRB", at, bounds["qcrb"], panel=panel, dash="dashed")
 
 
-def _draw_bounds(axes: Axes, at: Any, bounds: Mapping[str, Any]) -> None:
-    axes.plot(at, floats(bounds["crb"]), color=INK, label="CRB")
-    axes.plot(at, floats(bounds["qcrb"]), color=BLUE, linestyle="--", label="QCRB")
-
-
-def _draw_curve(axis: str, curve: Mapping[str, Any], axes: Axes, name: str) -> None:
-    label, logarithmic = _AXES[axis]
-    line, fine = curve[name], curve.get("bounds", curve)
-    _draw_bounds(axes, fine["at"], fine[name])
-    ends = np.transpose([floats(pair) for pair in line["spread_ci95"]])
-    style: Style = {"color": VERMILLION, "label": "spread"}
-    whiskers(axes, curve["at"], floats(line["spread"]), ends, style=style)
-    axes.set(xscale="log" if logarithmic else "linear", xlabel=label, ylabel="standard deviation")
-    plain_log(axes, "y")
-
-
-def _draw_pulls(found: Mapping[str, Any], axes: Axes, name: str) -> None:
-    bins = found[name]
-    counts, edges = floats(bins["counts"]), floats(bins["edges"])
-    axes.stairs(counts, edges, fill=True, color=VERMILLION, label="fits")
-    axes.plot((edges[1:] + edges[:-1]) / 2, floats(bins["expected"]), color=INK, label="normal")
-    axes.set_ylim(0, 1.25 * max(counts.max(), 1.0))
-    whole_numbers(axes, "(estimate − truth) / σ", "fits")
-
-
-def _draw_ranks(found: Mapping[str, Any], axes: Axes, name: str) -> None:
-    bins = found[name]
-    counts = floats(bins["counts"])
-    edges = np.linspace(0, bins["possible"], counts.size + 1)
-    axes.stairs(counts, edges, fill=True, color=BLUE, label="posteriors")
-    axes.axhline(float(counts.mean()), color=INK, linewidth=1, label="uniform")
-    if counts.sum() >= ENOUGH_RANKS:
-        axes.set_title(f"p = {bins['p_value']:.2g}", loc="right", fontsize=8)
-    axes.set_ylim(0, 1.25 * max(counts.max(), 1.0))
-    whole_numbers(axes, "rank of the truth", "posteriors")
+def _points(
+    series: str, at: Sequence[float], line: Mapping[str, Any], key: str, panel: str = ""
+) -> list[Row]:
+    """Make the points of a statistic with its intervals."""
+    ends = np.asarray(line[f"{key}_ci95"], float).reshape(-1, 2).T
+    return marks("point", series, at, line[key], ends, panel=panel)
 
 
 # ---- Other people's estimators -------------------------------------------------------------------
 
 
-def render_challenge(document: Mapping[str, Any], *, folder: Path | None = None) -> str:
-    """Make the page of scored results, and write its figures."""
-    drawn = publish(part_figures(document["parts"]), folder)
+def render_challenge(document: Mapping[str, Any]) -> str:
+    """Make the page of scored results."""
     table_1 = document.get("table_1")
     sections = [
-        _ranking_section(document),
-        *(_part_section(name, part, drawn) for name, part in document["parts"].items()),
+        _ranking_section(document, document["parts"]),
+        *(_part_section(name, part) for name, part in document["parts"].items()),
         *([_table_1(table_1)] if table_1 else []),
         _made(document),
     ]
@@ -360,37 +314,27 @@ def contest_parts(study: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def contest_sections(study: Mapping[str, Any], drawn: Mapping[str, Markup]) -> list[Section]:
+def contest_sections(study: Mapping[str, Any]) -> list[Section]:
     """Make the sections of a benchmark that other estimators took part in."""
-    curves = study["estimator_curves"]
-    charts = [
-        Chart(f"estimators-{axis}", f"Error against {label}", svg, wide=True)
-        for axis, (label, _) in _AXES.items()
-        if (svg := drawn.get(f"estimators_{axis}"))
-    ]
-    if "estimators_recall" in drawn:
-        rate = study["detection"]["false_alarm_rate"]
-        caption = (
-            f"False alarms in {100 * rate:.3g} % of empty regions; the matched filter at a known "
-            "place is what no test can beat."
-        )
-        recall = drawn["estimators_recall"]
-        charts.append(Chart("estimators-recall", "Recall against mass", recall, caption, True))
-    where = f"Where each leaves the bound, mode {curves['mode']}"
+    curve, parts = study["estimator_curves"], contest_parts(study)
+    charts = [_curve_chart(axis, curve[axis]) for axis in _AXES if axis in curve]
+    if study["detection"]["mass_kda"] and study["detection"]["estimators"]:
+        charts.append(_recall_chart(study["detection"]))
+    where = f"Where each leaves the bound, mode {curve['mode']}"
     sections = [
-        _ranking_section(study),
+        _ranking_section(study, parts),
         *(
-            _part_section(f"estimators-{mode}", part, drawn, f"Estimators, mode {mode}")
-            for mode, part in contest_parts(study).items()
+            _part_section(f"estimators-{mode}", part, f"Estimators, mode {mode}")
+            for mode, part in parts.items()
         ),
-        Section("estimators-curves", where, charts=charts, tables=[_best_table(curves)]),
+        Section("estimators-curves", where, charts=charts, tables=[_best_table(curve)]),
     ]
-    if "estimators_map" in drawn:
-        sections.append(_map_section(study["estimator_map"], drawn["estimators_map"]))
+    if study["estimator_map"]["parameters"]:
+        sections.append(_map_section(study["estimator_map"]))
     return sections
 
 
-def _map_section(found: Mapping[str, Any], svg: Markup) -> Section:
+def _map_section(found: Mapping[str, Any]) -> Section:
     """Say who is best where, in a map and with all who are as good in a table."""
     rows = []
     for name in _named(found["parameters"]):
@@ -406,54 +350,51 @@ def _map_section(found: Mapping[str, Any], svg: Markup) -> Section:
         numeric("information kept", of("kept", number, 2)),
         worded("as good", lambda row: ", ".join(row["equal"] or ()) or "—"),
     ]
-    caption = (
-        "Numbers are the information that the best one keeps, of "
-        f"{found['trials']} particles each; + where another is as good, by the interval of the "
-        "ratio of mean square errors on the same counts."
-    )
-    name = "Best estimator by light and height"
+    cells = [
+        {
+            "panel": row["parameter"],
+            "row": f"{row['height']:.0f}",
+            "column": f"{row['photons']:g}",
+            "value": row["best"] or "—",
+            "text": f"{number(row['kept'], 2)}{'+' if row['equal'] else ''}" if row["best"] else "",
+        }
+        for row in sorted(rows, key=lambda row: -row["height"])
+    ]
     return Section(
         "estimators-map",
         f"Who is best where, mode {found['mode']}",
-        charts=[Chart("estimators-map-chart", name, svg, caption, True)],
+        charts=[heatmap("best-estimator", cells, {"trials": found["trials"]})],
         tables=[tabulate(rows, columns, "The same, with all that are as good")],
     )
 
 
-def contest_figures(study: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
-    """Draw the curves of a benchmark that other estimators took part in."""
-    curves = study["estimator_curves"]
-    for axis in _AXES:
-        if axis in curves:
-            yield f"estimators_{axis}", _curve_figure(axis, curves[axis])
-    if study["estimator_map"]["parameters"]:
-        yield "estimators_map", _map_figure(study["estimator_map"], list(study["estimators"]))
-    if study["detection"]["mass_kda"] and study["detection"]["estimators"]:
-        yield "estimators_recall", _recall_figure(study["detection"])
-
-
-def part_figures(parts: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
-    """Draw what each estimator reached of every parameter, of each part."""
-    for name, part in parts.items():
-        if any(_scored(part, p) for p in LABELS):
-            yield f"part_{name}", _reached_figure(part)
-
-
-def _ranking_section(document: Mapping[str, Any]) -> Section:
-    places = [{"place": place, **one} for place, one in enumerate(document["ranking"], 1)]
+def _ranking_section(document: Mapping[str, Any], parts: Mapping[str, Any]) -> Section:
+    """Rank the estimators; those that know more than the counts, or do not look, come last."""
+    remarks: dict[str, str] = {}
+    for part in parts.values():
+        for who, entry in part["estimators"].items():
+            for scored in (entry[name] for name in LABELS if name in entry):
+                if _unranked(scored):
+                    remarks[who] = scored["verdict"]
+    places = [{**one, "remark": remarks.get(one["estimator"], "")} for one in document["ranking"]]
+    places.sort(key=lambda one: bool(one["remark"]))
     columns = [
-        worded("place", lambda row: "—" if row["below_bound"] else row["place"]),
+        worded("place", lambda row: "—" if row["remark"] else row["place"]),
         worded("estimator", "estimator"),
         numeric("information kept", of("kept")),
-        worded("", lambda row: "below the bound: not ranked" if row["below_bound"] else ""),
+        worded("", lambda row: f"not ranked: {row['remark']}" if row["remark"] else ""),
     ]
-    tables = [tabulate(places, columns, "Information kept, over all parameters and parts")]
+    ranked = [{"place": place, **one} for place, one in enumerate(places, 1)]
+    tables = [tabulate(ranked, columns, "Information kept, over all parameters and parts")]
     return Section("ranking", "Ranking", notes=_HOW, tables=tables)
 
 
-def _part_section(
-    name: str, part: Mapping[str, Any], drawn: Mapping[str, Markup], title: str = ""
-) -> Section:
+def _unranked(scored: Mapping[str, Any]) -> bool:
+    """Tell whether an estimator knows more than the counts, or does not look at them."""
+    return bool(scored.get("verdict", "").startswith(_UNRANKED))
+
+
+def _part_section(name: str, part: Mapping[str, Any], title: str = "") -> Section:
     bounds = part.get("bounds") or {}
     lead = "; ".join(
         f"{LABELS[p]}: CRB {number(b['crb'])}, Holevo {number(b['holevo'])}, "
@@ -468,14 +409,12 @@ def _part_section(
     tables += [table for table in (_paired(part), _failures(part), _recall(part)) if table.rows]
     entries = part["estimators"].items()
     notes = [f"{who}: {'; '.join(e['notes'])}." for who, e in entries if e.get("notes")]
-    svg = drawn.get(f"part_{name}")
-    charts = [Chart(f"{name}-reached", "Spread over CRB", svg, wide=True)] if svg else []
     about = f"{part['about']}; " if part["about"] else ""
     return Section(
         name,
         title or name.replace("_", " "),
         f"{about}mode {part['mode']}, {part['trials']} particles. {lead}",
-        charts=charts,
+        charts=list(_reached_charts(name, part)),
         tables=tables,
         notes=notes,
     )
@@ -488,13 +427,12 @@ def _scored(part: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
         for who, entry in part["estimators"].items()
         if name in entry
     ]
-    return sorted(
-        found, key=lambda e: (bool(e.get("below_bound")), -(e.get("efficiency_crb") or 0.0))
-    )
+    return sorted(found, key=lambda e: (_unranked(e), -(e.get("efficiency_crb") or 0.0)))
 
 
 _SCORES = (
     worded("estimator", "who"),
+    worded("remark", lambda e: e.get("verdict", "")),
     numeric("efficiency", _interval("efficiency_crb")),
     numeric("spread / CRB", _interval("spread_over_crb")),
     numeric("/ Holevo", of("spread_over_holevo")),
@@ -505,7 +443,6 @@ _SCORES = (
     numeric("68 %", of("coverage68", percent)),
     numeric("answered", lambda e: f"{e['answered']} of {e['answered'] + e['failed']}"),
     numeric("ms each", of("seconds_per_fit", lambda s: number(None if s is None else 1000 * s))),
-    worded("remark", lambda e: e.get("verdict", "")),
 )
 
 
@@ -562,7 +499,7 @@ def _best_table(curves: Mapping[str, Any]) -> Table:
             row = {"along": label, "at": at}
             for name in PARAMETERS:
                 reached = {
-                    who: floats(line[name]["efficiency_crb"])[k]
+                    who: float(np.asarray(line[name]["efficiency_crb"], float)[k])
                     for who, line in curve["estimators"].items()
                     if name in line
                 }
@@ -617,88 +554,31 @@ def _made(document: Mapping[str, Any]) -> Section:
 # ---- Figures of estimators -----------------------------------------------------------------------
 
 
-def _curve_figure(axis: str, curve: Mapping[str, Any]) -> Figure:
-    names = _named(curve["bounds"])
-    label, logarithmic = _AXES[axis]
-    figure, panels = row_of_panels(len(names), 3.1, 3.9)
-    panels[0].set_ylabel("root mean square error")
-    for axes, name in zip(panels, names, strict=True):
-        _draw_bounds(axes, curve["at"], curve["bounds"][name])
-        for k, (who, lines) in enumerate(curve["estimators"].items()):
-            _draw_points(axes, curve["at"], lines[name], "rmse", k, who)
-        axes.set(xscale="log" if logarithmic else "linear", title=parameter(name), xlabel=label)
-        plain_log(axes, "y")
-    _legend_below(figure)
-    return figure
+def _curve_chart(axis: str, curve: Mapping[str, Any]) -> Chart:
+    label, log = _AXES[axis]
+    parts: list[list[Row]] = []
+    for name in _named(curve["bounds"]):
+        panel = parameter(name)
+        parts += _bounds(curve["at"], curve["bounds"][name], panel)
+        for who, lines in curve["estimators"].items():
+            parts.append(_points(who, curve["at"], lines[name], "rmse", panel))
+    return curves("estimators", parts, {"x": label, "log": log}, of=f"-{axis}")
 
 
-def _draw_points(
-    axes: Axes, at: Sequence[float], line: Mapping[str, Any], key: str, k: int, who: str
-) -> None:
-    """Draw a statistic of an estimator with its intervals, if any is known."""
-    values = floats(line[key])
-    if np.isfinite(values).any():
-        ends = np.transpose([floats(pair) for pair in line[f"{key}_ci95"]])
-        mark: Style = {"fmt": _MARKERS[k % len(_MARKERS)], "color": _COLOURS[k % len(_COLOURS)]}
-        whiskers(axes, at, values, ends, style={**mark, "lw": 0.8, "label": who})
-
-
-def _map_figure(found: Mapping[str, Any], names: Sequence[str]) -> Figure:
-    """Draw who is best at each height and light: a colour and a letter for each estimator."""
-    tables = {p: found["parameters"][p] for p in _named(found["parameters"])}
-    winners = {who for table in tables.values() for row in table["best"] for who in row if who}
-    letters = {who: chr(ord("A") + k) for k, who in enumerate(w for w in names if w in winners)}
-    colours = {who: _MAP_COLOURS[k % len(_MAP_COLOURS)] for k, who in enumerate(letters)}
-    heights, photons = found["height_nm"], found["photons"]
-    figure = new_figure(1.1 + 2.4 * len(tables), 3.6)
-    panels = figure.subplots(1, len(tables), squeeze=False)[0]
-    panels[0].set_ylabel("height [nm]")
-    for axes, (name, table) in zip(panels, tables.items(), strict=True):
-        for row, column in np.ndindex(len(heights), len(photons)):
-            best, kept, equal = (table[key][row][column] for key in ("best", "kept", "equal"))
-            how: Style = {"facecolor": colours.get(best, GREY), "edgecolor": "white"}
-            box = Rectangle((column - 0.5, row - 0.5), 1, 1, alpha=0.6, linewidth=1.5, **how)
-            axes.add_patch(box)
-            words = f"{letters[best]} {number(kept, 2)}{'+' if equal else ''}" if best else "—"
-            axes.text(column, row, words, ha="center", va="center", fontsize=7.5, color=INK)
-        axes.set(xlim=(-0.5, len(photons) - 0.5), ylim=(-0.5, len(heights) - 0.5))
-        axes.set_xticks(range(len(photons)), [f"{v:g}" for v in photons])
-        axes.set_yticks(range(len(heights)), [f"{v:.0f}" for v in heights])
-        axes.tick_params(length=0)
-        axes.spines[:].set_visible(False)
-        axes.set(title=LABELS[name], xlabel="collected photons")
-    patches = [
-        Patch(facecolor=colours[who], alpha=0.6, label=f"{letter} {who}")
-        for who, letter in letters.items()
-    ]
-    columns = min(len(patches), 5) or 1
-    figure.legend(handles=patches, loc="outside lower center", ncols=columns, fontsize=8)
-    return figure
-
-
-def _recall_figure(found: Mapping[str, Any]) -> Figure:
-    figure, axes = one_panel(5.0, 3.9)
+def _recall_chart(found: Mapping[str, Any]) -> Chart:
     at = found["mass_kda"]
-    axes.plot(at, floats(found["matched_filter"]), color=INK, label="best possible")
-    for k, (who, line) in enumerate(found["estimators"].items()):
-        _draw_points(axes, at, line, "recall", k, who)
-    axes.set(xscale="log", xlabel="mass [kDa]", ylabel="recall")
-    _legend_below(figure)
-    return figure
+    parts = [marks("line", "best possible", at, found["matched_filter"])]
+    parts += [_points(who, at, line, "recall") for who, line in found["estimators"].items()]
+    return curves("recall", parts, {"rate": f"{100 * found['false_alarm_rate']:.3g}"})
 
 
-def _reached_figure(part: Mapping[str, Any]) -> Figure:
-    """Draw spread over CRB of every estimator, with its interval."""
-    scores = {p: scored for p in LABELS if (scored := _scored(part, p))}
-    rows = max(map(len, scores.values()))
-    figure, panels = row_of_panels(len(scores), 3.4, 0.8 + 0.27 * rows)
-    for axes, (name, scored) in zip(panels, scores.items(), strict=True):
-        known = [e for e in scored if e.get("spread_over_crb") is not None]
-        at = np.arange(len(known))[::-1]
-        values = floats(e["spread_over_crb"] for e in known)
-        ends = np.reshape([floats(e["spread_over_crb_ci95"]) for e in known], (-1, 2)).T
-        whiskers(axes, at, values, ends, along="x", style={"color": _COLOURS[0]})
-        axes.axvline(1.0, color=INK, linewidth=1)
-        axes.set_yticks(at, [e["who"] for e in known])
-        axes.set(xscale="log", title=LABELS[name], xlabel="spread / CRB")
-    return figure
+def _reached_charts(name: str, part: Mapping[str, Any]) -> Iterator[Chart]:
+    """Show spread over CRB of every estimator, with its interval."""
+    rows = [
+        interval(e["who"], e["spread_over_crb"], e["spread_over_crb_ci95"], panel=LABELS[p])
+        for p in LABELS
+        for e in _scored(part, p)
+        if e.get("spread_over_crb") is not None
+    ]
+    if rows:
+        yield intervals("reached", rows, of=f"-{name}")

@@ -5,48 +5,44 @@ Everything arrives as reports and tables; nothing is computed here but what a fi
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from markupsafe import Markup
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from iscat_analysis.bounds import PupilOptimum, plan, tradeoff
 from iscat_analysis.config import SCHEMES, config_to_toml
 from iscat_analysis.records import PARAMETERS, FloatArray
 from iscat_analysis.report.numbers import LABELS, Fact, numeric, of, parameter, tabulate, worded
 from iscat_analysis.report.output import atomic_folder
-from iscat_analysis.report.page import Chart, Section, render_document
-from iscat_analysis.report.style import (
+from iscat_analysis.report.page import (
     BLUE,
     GREY,
-    GRID,
-    HALO,
-    INK,
+    LINE,
     VERMILLION,
-    Style,
-    legend,
-    new_figure,
-    one_panel,
-    picture,
-    plain_log,
-    publish,
+    Chart,
+    Row,
+    Section,
+    curves,
+    interval,
+    intervals,
+    marks,
+    pictures,
+    render_document,
+    with_ends,
 )
 from iscat_analysis.report.tables import write_csv, write_json
 
-BOUNDS_FILES = frozenset(
-    {"bounds.json", "scan.csv", "scan.png", "scan.svg", "tradeoff.png", "tradeoff.svg"}
-    | {"optics.toml", "pupil.png", "pupil.svg"}
-)
+BOUNDS_FILES = frozenset({"bounds.json", "bounds.html", "scan.csv", "optics.toml"})
 """What `write_bounds` may leave in its folder."""
 
-OPTICS_BOUNDS_FILES = frozenset({"optics_bounds.json", "needed.csv", "needed.png", "needed.svg"})
+OPTICS_BOUNDS_FILES = frozenset({"optics_bounds.json", "bounds.html", "needed.csv"})
 """What `write_optics_bounds` leaves in its folder."""
+
+_KINDS = {"crb_joint": "CRB, joint", "crb_single": "CRB, single", "qcrb": "QCRB"}
 
 
 def write_bounds(
@@ -62,15 +58,46 @@ def write_bounds(
     """Write the bounds of one experiment, and of a scan through it."""
     with atomic_folder(folder, overwrite, known=BOUNDS_FILES) as building:
         write_json("bounds", report, building / "bounds.json")
+        charts: list[Chart] = []
         if table is not None:
             write_csv(table, building / "scan.csv")
-            publish(scan_figures(table, label, here), building)
+            charts += scan_charts(table, label, here)
         if design is not None:
             (building / "optics.toml").write_text(design_toml(design), encoding="utf-8")
-            publish([("pupil", pupil_figure(design))], building)
+            charts += pupil_charts(design)
         if {"z_nm", "mass_kda"} <= set(report["at"]["free"]):
-            publish([("tradeoff", tradeoff_figure(report))], building)
+            charts.append(tradeoff_chart(report))
+        _write_page(_bounds_section(report, charts), building)
     return folder
+
+
+def _write_page(section: Section, folder: Path) -> None:
+    at = "of one particle, from its images and from all light that was collected"
+    page = render_document("Bounds", f"What can be known {at}", [section])
+    (folder / "bounds.html").write_text(page, encoding="utf-8")
+
+
+def _bounds_section(report: Mapping[str, Any], charts: Sequence[Chart]) -> Section:
+    """Lay out the bounds of one experiment."""
+    actual, at = report["actual"], report["at"]
+    columns = (
+        worded("parameter", of("name", parameter)),
+        *(numeric(label, of(kind)) for kind, label in _KINDS.items()),
+        numeric("Holevo", of("holevo"), "one measurement of all parameters at once"),
+    )
+    known = {**actual, "holevo": {name: report["holevo"][name] for name in at["free"]}}
+    rows = [
+        {"name": name, **{kind: known.get(kind, {}).get(name) for kind in (*_KINDS, "holevo")}}
+        for name in PARAMETERS
+    ]
+    photons = report["n_scattered"]
+    facts = [
+        Fact("Scattered photons", f"{photons['collected']:,.0f}", note="collected"),
+        Fact("on the camera", f"{photons['camera']:,.0f}"),
+    ]
+    table = tabulate(rows, columns, "Standard deviations for these photons")
+    lead = f"{SCHEMES[at['scheme']].title}, mode {at['mode']}."
+    return Section("bounds", "Bounds", lead, facts, charts, [table])
 
 
 def design_toml(design: PupilOptimum) -> str:
@@ -92,57 +119,49 @@ def design_toml(design: PupilOptimum) -> str:
     )
 
 
-def pupil_figure(design: PupilOptimum) -> Figure:
-    """Draw what the best pupil gives, and how a particle looks through it."""
-    figure = new_figure(8.4, 3.6)
-    left, right = figure.subplots(1, 2, width_ratios=[1.3, 1])
-    at = np.arange(len(design.chosen))
-
-    for kind, marker, color, label in (
-        ("configured", "D", INK, "configured"),
-        ("best", "D", VERMILLION, "best pupil"),
-        ("holevo", "o", BLUE, "all at once, at best (Holevo)"),
-    ):
-        values = [each[kind] / each["qcrb"] for each in design.sigma.values()]
-        left.plot(at, values, marker, color=color, label=label)
-    left.axhline(1.0, color=BLUE, lw=1.2, ls="--", label="quantum bound of each alone")
-    left.set_xticks(at, [LABELS[name] for name in design.chosen])
-    left.set(xlim=(-0.5, at.size - 0.5), ylabel="σ over its own quantum bound")
-    left.set_ylim(bottom=0.0)
+def pupil_charts(design: PupilOptimum) -> Iterator[Chart]:
+    """Show what the best pupil gives, and how a particle looks through it."""
+    kinds = {"configured": "configured", "best": "best pupil", "holevo": "all at once, at best"}
+    rows = [
+        interval(LABELS[name], each[kind] / each["qcrb"], series=label)
+        for name, each in zip(design.chosen, design.sigma.values(), strict=True)
+        for kind, label in kinds.items()
+    ]
+    yield intervals("best-pupil", rows)
     experiment = plan(design.config)
     x, y, z = (float(v) for v in experiment.theta[:3])
     image = experiment.model.image(experiment.grid, x, y, z, experiment.mass_kda)
     edge, half = float(np.abs(image).max()), float(np.ptp(experiment.grid.x_nm)) / 2e3
-    picture(right, image, half, (-edge, edge), "contrast, best pupil")
-    right.set(xlabel="x [µm]", ylabel="y [µm]")
-    legend(figure, where="upper left")
-    return figure
+    shown = [(with_ends("contrast", -edge, edge), image, (-edge, edge))]
+    yield pictures("particle", shown, half)
 
 
-def tradeoff_figure(report: Mapping[str, Any]) -> Figure:
-    """Draw how well one measurement can tell height and mass, and how well this microscope does."""
+def tradeoff_chart(report: Mapping[str, Any]) -> Chart:
+    """Show how well one measurement can tell height and mass, and how well this microscope does."""
     information = np.asarray(report["qfi"]) + 1j * np.asarray(report["qfi_imaginary"])
     edge = tradeoff(information[2:, 2:])
     actual, both = report["actual"], report["holevo"]
     names = ("z_nm", "mass_kda")
     own = np.array([actual["qcrb"][name] for name in names])
     camera = np.array([actual["crb_joint"][name] for name in names])
-    figure, axes = one_panel(5.2, 4.2)
-    axes.axvline(own[0], color=BLUE, lw=1.2, ls="--", label="quantum bound of each alone")
-    axes.axhline(own[1], color=BLUE, lw=1.2, ls="--")
-    axes.plot(*edge.T, color=BLUE, lw=1.8, label="both at once, at best (Holevo)")
-    axes.plot(both["z_nm"], both["mass_kda"], "o", color=BLUE, ms=5, label="with equal weights")
-    if np.isfinite(camera).all():
-        axes.plot(*camera, "D", color=VERMILLION, ms=6, label="this microscope, joint CRB")
+    alone, at_best = "quantum bound of each alone", "both at once, at best (Holevo)"
+    here, star = "this microscope, joint CRB", "with the best pupil"
+    wide = np.nanmax(np.vstack([camera * 1.15, own * 2.2]), axis=0)
+    inside = (edge[:, 0] <= wide[0]) & (edge[:, 1] <= wide[1])
+    points = [(here, camera)] if np.isfinite(camera).all() else []
     best = report.get("pupil", {}).get("sigma", {})
     if set(names) <= set(best):
-        star: Style = {"color": VERMILLION, "ms": 10, "label": "with the best pupil"}
-        axes.plot(*(best[name]["best"] for name in names), "*", **star)
-    wide = np.nanmax(np.vstack([camera * 1.15, own * 2.2]), axis=0)
-    axes.set(xlim=(0.8 * own[0], wide[0]), ylim=(0.8 * own[1], wide[1]))
-    axes.set(xlabel="σ of height [nm]", ylabel="σ of mass [kDa]")
-    legend(figure, where="upper left", columns=2)
-    return figure
+        points.append((star, np.array([best[name]["best"] for name in names])))
+    equal = [both[name] for name in names]
+    parts = [
+        marks("line", alone, [own[0]] * 2, [0.8 * own[1], wide[1]], dash="dashed"),
+        marks("line", alone, [0.8 * own[0], wide[0]], [own[1]] * 2, dash="dashed"),
+        marks("line", at_best, *edge[inside].T),
+        marks("point", at_best, equal[:1], equal[1:]),
+        *(marks("point", name, at[:1], at[1:]) for name, at in points),
+    ]
+    span = {"x": [0.8 * own[0], wide[0]], "y": [0.8 * own[1], wide[1]]}
+    return curves("tradeoff", parts, {"span": span})
 
 
 def write_optics_bounds(
@@ -152,64 +171,63 @@ def write_optics_bounds(
     with atomic_folder(folder, overwrite, known=OPTICS_BOUNDS_FILES) as building:
         write_json("optics_bounds", report, building / "optics_bounds.json")
         write_csv(pd.DataFrame(report["needed"]), building / "needed.csv")
-        publish(needed_figures(report), building)
+        lead = f"{report['events']} particles of {report['at']['mass_kda']:g} kDa, all together."
+        columns = (
+            worded("parameter", "parameter"),
+            numeric("value", of("value")),
+            numeric("σ", of("sigma")),
+            numeric("without images", of("usual_error")),
+        )
+        table = tabulate(report["parameters"], columns, "Parameters of the optics")
+        charts = [needed_chart(report)]
+        _write_page(Section("optics", "The optics", lead, charts=charts, tables=[table]), building)
     return folder
 
 
-def needed_figures(report: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
-    """Draw how many particles of which mass the precisions take."""
-    figure, axes = one_panel(6.4, 4.2)
+def needed_chart(report: Mapping[str, Any]) -> Chart:
+    """Show how many particles of which mass the precisions take."""
     needed, goals = pd.DataFrame(report["needed"]), report["goals"]
-    lines = (
-        ("focus_nm", f"focus to {goals['focus_nm']:g} nm", BLUE, "-"),
-        ("mass_rel", f"masses to {100 * goals['mass_rel']:g} %, in common", INK, "-"),
-        ("identified", "everything identified", INK, ":"),
-    )
-    for column, label, color, dash in lines:
-        style: Style = {"color": color, "ls": dash, "lw": 1.8, "ms": 4, "label": label}
-        axes.plot(needed["mass_kda"], needed[column].astype(float), "o", **style)
-    here = report["at"]["mass_kda"], report["events"]
-    axes.plot(*here, "D", color=VERMILLION, ms=7, label="planned")
-    axes.set(xscale="log", yscale="log", xlabel="mass [kDa]", ylabel="particles needed")
-    axes.legend()
-    yield "needed", figure
+    lines = {
+        "focus_nm": f"focus to {goals['focus_nm']:g} nm",
+        "mass_rel": f"masses to {100 * goals['mass_rel']:g} %, in common",
+        "identified": "everything identified",
+    }
+    masses = needed["mass_kda"]
+    here = [report["at"]["mass_kda"]], [report["events"]]
+    parts = [marks("point", "planned", *here)]
+    for column, label in lines.items():
+        many = needed[column].astype(float)
+        dash = "dotted" if column == "identified" else "solid"
+        parts += [marks("line", label, masses, many, dash=dash)]
+        parts += [marks("point", label, masses, many)]
+    return curves("needed", parts)
 
 
-def scan_figures(table: pd.DataFrame, label: str, here: float) -> Iterator[tuple[str, Figure]]:
-    """Draw bounds and used information along a scan."""
-    figure = new_figure(11, 5.4)
-    grid = figure.subplots(2, 4, sharex=True, height_ratios=[1.7, 1])
+def scan_charts(table: pd.DataFrame, label: str, here: float) -> Iterator[Chart]:
+    """Show bounds and used information along a scan."""
     x = table.iloc[:, 0].to_numpy(float)
-    inside = x.min() <= here <= x.max()
-    if x.size > 1 and x.min() > 0 and x.max() / x.min() > 50:
-        grid[0, 0].set_xscale("log")
-    for (top, low), name in zip(grid.T, PARAMETERS, strict=True):
-        for kind, label_of, color, dash, width in (
-            ("crb_joint", "CRB, joint", INK, "-", 1.8),
-            ("crb_single", "CRB, single", INK, ":", 1.2),
-            ("qcrb", "QCRB", BLUE, "-", 1.8),
-        ):
+    log = "x" if x.size > 1 and x.min() > 0 and x.max() / x.min() > 50 else ""
+    configured = f"configured: {here:g}".replace("-", "−")
+    bounds, used = [], []
+    for name in PARAMETERS:
+        panel = parameter(name)
+        for kind, series in _KINDS.items():
             y = table[f"{kind}_{name}"].to_numpy(float)
             if np.isfinite(y).any():
-                top.plot(x, y, dash, color=color, lw=width, label=label_of)
-        plain_log(top, "y")
-        top.set_title(parameter(name))
-        low.plot(x, 100 * table[f"information_{name}"].to_numpy(float), color=BLUE, lw=1.5)
-        low.set(ylim=(0, 100), xlabel=label)
-        if inside:
-            named = f"configured: {here:g}".replace("-", "−")
-            low.axvline(here, color=VERMILLION, lw=1, dashes=(4, 3))
-            top.axvline(here, color=VERMILLION, lw=1, dashes=(4, 3), label=named)
-    grid[0, 0].set_ylabel("standard deviation")
-    grid[1, 0].set_ylabel("information used [%]")
-    legend(figure, where="upper center")
-    yield "scan", figure
+                dash = "dotted" if kind == "crb_single" else "solid"
+                bounds.append(marks("line", series, x, y, panel=panel, dash=dash))
+        share = 100 * table[f"information_{name}"].to_numpy(float)
+        used.append(marks("line", "information used", x, share, panel=panel))
+        if x.min() <= here <= x.max():
+            for parts in (bounds, used):
+                parts.append(marks("rule", configured, [here], panel=panel))
+    yield curves("scan", bounds, {"x": label, "log": log})
+    yield curves("used", used, {"x": label, "log": log})
 
 
 # ---- Dong et al. (2021) --------------------------------------------------------------------------
 
-SCHEME_COLORS = {"iscat": BLUE, "cobri": VERMILLION, "darkfield": INK}
-SHADES = ("#1B1D21", "#0072B2", "#009E73", "#D55E00", "#B5578C")
+SCHEME_COLORS = {"iscat": BLUE, "cobri": VERMILLION, "darkfield": LINE}
 
 
 @dataclass(frozen=True)
@@ -257,12 +275,8 @@ WAYS = {
 }
 
 PAPER_FILES = frozenset(
-    {"comparison.html", "comparison.csv"}
-    | {
-        f"{stem}.{end}"
-        for stem in ("table_1", "fig_2a", *(f"fig_{panel}" for panel in PANELS))
-        for end in ("png", "svg", "csv")
-    }
+    {"comparison.html", "comparison.csv", "table_1.csv", "fig_2a.csv"}
+    | {f"fig_{panel}.csv" for panel in PANELS}
 )
 """What `write_paper` leaves in its folder."""
 
@@ -280,8 +294,8 @@ _LEADS = {
     "2b": "Particle at height z, focus 1 µm above the coverslip for every z. Left as the authors "
     "computed it, here and below: per scattered photon on the field at z = focus = 0, refocusing "
     "while they differentiate. Exact: the stage held, per collected photon. Solid curves are "
-    "exact, dashed ones the authors'; dotted lines are quantum bounds. The lower panel shows how "
-    "far the two are apart.",
+    "exact, dashed ones the authors'; dotted lines are quantum bounds. How "
+    "far the two are apart is shown beside them.",
     "3": "Particle at 5 nm. Mass with everything else known, and for iSCAT with z unknown as well: "
     "in focus the image cannot tell height from mass.",
     "4a": "A weaker reference turns an interferometer into a dark-field microscope. β is the "
@@ -290,7 +304,7 @@ _LEADS = {
 
 
 def write_paper(
-    curves: pd.DataFrame,
+    rows: pd.DataFrame,
     images: Mapping[tuple[str, float], FloatArray],
     table: pd.DataFrame,
     quantum: Mapping[tuple[str, str], FloatArray],
@@ -303,10 +317,13 @@ def write_paper(
     with atomic_folder(folder, overwrite, known=PAPER_FILES) as building:
         write_csv(_images_table(images, field_nm), building / "fig_2a.csv", 5)
         for panel in PANELS:
-            write_csv(curves[curves["panel"] == panel], building / f"fig_{panel}.csv")
+            write_csv(rows[rows["panel"] == panel], building / f"fig_{panel}.csv")
         for name in ("table_1.csv", "comparison.csv"):
             write_csv(table, building / name)
-        drawn = publish(_paper_figures(curves, images, table, quantum, field_nm), building)
+        drawn = {
+            panel: panel_charts(panel, rows[rows["panel"] == panel], quantum) for panel in PANELS
+        }
+        drawn = {"2a": [images_chart(images, field_nm)], **drawn}
         bar = [("table-1", "Table 1"), *((f"figure-{n}", f"Figure {n}") for n in (2, 3, 4))]
         frame = {
             "kicker": "iscat bounds",
@@ -326,20 +343,6 @@ def write_paper(
     return folder
 
 
-def _paper_figures(
-    curves: pd.DataFrame,
-    images: Mapping[tuple[str, float], FloatArray],
-    table: pd.DataFrame,
-    quantum: Mapping[tuple[str, str], FloatArray],
-    field_nm: float,
-) -> Iterator[tuple[str, Figure]]:
-    """Draw every panel; a generator, so that `publish` draws in its own style."""
-    yield "table_1", table_figure(table)
-    yield "fig_2a", images_figure(images, field_nm)
-    for panel in PANELS:
-        yield f"fig_{panel}", panel_figure(panel, curves[curves["panel"] == panel], quantum)
-
-
 def _images_table(images: Mapping[tuple[str, float], FloatArray], field_nm: float) -> pd.DataFrame:
     parts = []
     for (scheme, z), image in images.items():
@@ -349,7 +352,7 @@ def _images_table(images: Mapping[tuple[str, float], FloatArray], field_nm: floa
     return pd.concat(parts, ignore_index=True)
 
 
-def _sections(table: pd.DataFrame, drawn: Mapping[str, Markup]) -> list[Section]:
+def _sections(table: pd.DataFrame, drawn: Mapping[str, list[Chart]]) -> list[Section]:
     exact = table.set_index("quantity")["exact"]
     printed = {"x": 71, "y": 57, "z_iscat": 18, "z_cobri": 114}
     columns = (
@@ -367,7 +370,7 @@ def _sections(table: pd.DataFrame, drawn: Mapping[str, Markup]) -> list[Section]
                 Fact(QUANTITY_LABELS[key][5:-5], f"{exact[key]:.1f}", "nm", f"printed: {value}")
                 for key, value in printed.items()
             ],
-            charts=[Chart("chart-1", "Five ways to compute Table 1", drawn["table_1"], wide=True)],
+            charts=[table_chart(table)],
             tables=[tabulate(table.to_dict("records"), columns, "Table 1, five ways")],
             notes=_NOTES,
         )
@@ -375,131 +378,100 @@ def _sections(table: pd.DataFrame, drawn: Mapping[str, Markup]) -> list[Section]
     names = {"2a": "figure-2", "3": "figure-3", "4a": "figure-4"}
     titles = {"2a": "Fig. 2a: images", **{p: spec.title for p, spec in PANELS.items()}}
     for panel, title in titles.items():
-        title = title.replace("Fig. ", "Figure ")
-        subject = title.partition(": ")[2].capitalize()
-        charts = [Chart(f"chart-{panel}", subject, drawn[f"fig_{panel}"], wide=True)]
-        name = names.get(panel, f"panel-{panel}")
-        sections.append(Section(name, title, _LEADS.get(panel, ""), charts=charts))
+        title, name = title.replace("Fig. ", "Figure "), names.get(panel, f"panel-{panel}")
+        sections.append(Section(name, title, _LEADS.get(panel, ""), charts=drawn[panel]))
     return sections
 
 
-def curves_of(panel: str, rows: pd.DataFrame, convention: str) -> list[tuple[pd.DataFrame, Style]]:
-    """Gather the curves of a panel, and how each is drawn."""
+def curves_of(panel: str, rows: pd.DataFrame, convention: str) -> list[tuple[pd.DataFrame, str]]:
+    """Gather the curves of a panel, and what each is called."""
     spec, found = PANELS[panel], []
     rows = rows[(rows["convention"] == convention) & rows["quantity"].isin(spec.quantities)]
     key = "attenuation" if spec.by_attenuation else "scheme"
     if spec.by_attenuation:
         rows = rows.sort_values("attenuation", ascending=False, kind="stable")
-    shades = iter(SHADES)
     for (first, quantity), group in rows.groupby([key, "quantity"], sort=False):
         joint = str(quantity).endswith("joint")
         if joint and first != "iscat":
             continue  # as in D21; the CSV has all three
         if not spec.by_attenuation:
-            name, color = SCHEMES[first].title, SCHEME_COLORS[first]
+            name = SCHEMES[first].title
         else:
-            name, color = (f"β = {first:g}", next(shades)) if first else ("dark field", GREY)
-        name = f"{name}, with z unknown" if joint else name
-        found.append((group, {"color": color, "alpha": 0.55 if joint else 1.0, "label": name}))
+            name = f"β = {first:g}" if first else "dark field"
+        found.append((group, f"{name}, with z unknown" if joint else name))
     return found
 
 
 def limits_of(
     panel: str, quantum: Mapping[tuple[str, str], FloatArray], convention: str
-) -> list[tuple[str, float, str]]:
-    """Gather the quantum bounds of a panel: name, value and colour of each."""
+) -> list[tuple[str, float]]:
+    """Gather the quantum bounds of a panel: name and value of each."""
     spec = PANELS[panel]
     if spec.bound is None:
         return []
     if spec.bound != 2:
-        return [("quantum bound", float(quantum[convention, "iscat"][spec.bound]), GREY)]
+        return [("quantum bound", float(quantum[convention, "iscat"][spec.bound]))]
     schemes = {"4a": ("cobri",), "4b": ("iscat",)}.get(panel, ("iscat", "cobri"))
-    colors = dict.fromkeys(schemes, GREY) if spec.by_attenuation else SCHEME_COLORS
     return [
-        (f"quantum bound, {SCHEMES[s].title}", float(quantum[convention, s][2]), colors[s])
-        for s in schemes
+        (f"quantum bound, {SCHEMES[s].title}", float(quantum[convention, s][2])) for s in schemes
     ]
 
 
-def panel_figure(
+def panel_charts(
     panel: str, rows: pd.DataFrame, quantum: Mapping[tuple[str, str], FloatArray]
-) -> Figure:
-    """Draw a panel, both conventions over each other, and below it how far they are apart."""
+) -> list[Chart]:
+    """Draw a panel, both conventions over each other, and beside it how far they are apart."""
     spec = PANELS[panel]
-    figure = new_figure(8.2, 4.8)
-    top, low = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
+    top: list[list[Row]] = []
+    apart: list[list[Row]] = []
     both = (curves_of(panel, rows, convention) for convention in ("dong2021", "exact"))
-    for (authors, _), (exact, style) in zip(*both, strict=True):
+    for (authors, _), (exact, name) in zip(*both, strict=True):
         theirs, ours = (curve["value"].to_numpy(float) for curve in (authors, exact))
-        top.plot(exact["x"], ours, lw=1.6, **style)
-        unnamed: Style = {**style, "label": None}
-        top.plot(authors["x"], theirs, "--", lw=1.1, **unnamed)
-        low.plot(exact["x"], ours / theirs if spec.log else ours - theirs, lw=1.3, **unnamed)
-    for convention, dots in (("exact", (1.5, 2)), ("dong2021", (1.5, 6))):
-        for name, value, color in limits_of(panel, quantum, convention):
-            label = name if convention == "exact" else None
-            top.axhline(value, color=color, lw=1.1, dashes=dots, label=label)
-    handles, labels = top.get_legend_handles_labels()
-    handles += [Line2D([], [], color=GREY), Line2D([], [], color=GREY, ls="--")]
-    labels += ["exact", "authors' convention"]
-    if spec.log:
-        plain_log(top, "y")
-    low.axhline(1.0 if spec.log else 0.0, color=GREY, lw=0.8)
-    low.set(xlabel=spec.x_label, ylabel="exact / authors'" if spec.log else "exact − authors'")
-    top.set_ylabel(spec.y_label)
-    top.margins(x=0.01)
-    figure.align_ylabels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4)
-    return figure
+        top.append(marks("line", name, exact["x"], ours))
+        top.append(marks("line", name, authors["x"], theirs, dash="dashed"))
+        ratio = ours / theirs if spec.log else ours - theirs
+        apart.append(marks("line", name, exact["x"], ratio))
+    ends = [rows["x"].min(), rows["x"].max()]
+    for convention in ("exact", "dong2021"):
+        for name, value in limits_of(panel, quantum, convention):
+            top.append(marks("line", name, ends, [value] * 2, dash="dotted"))
+    colours = {SCHEMES[key].title: colour for key, colour in SCHEME_COLORS.items()}
+    colours |= {f"quantum bound, {name}": colour for name, colour in colours.items()}
+    colours = {} if spec.by_attenuation else {**colours, "quantum bound": GREY}
+    between = "exact / authors'" if spec.log else "exact − authors'"
+    subject = spec.title.partition(": ")[2].capitalize()
+    words = {"span": {"x": ends}, "colours": colours, "x": spec.x_label}
+    axes = {"title": subject, "y": spec.y_label, "log": "y" if spec.log else ""}
+    of = f"-{panel}"
+    return [
+        curves("panel", top, {**words, **axes}, of=of),
+        curves("apart", apart, {**words, "y": between}, of=of),
+    ]
 
 
-def images_figure(images: Mapping[tuple[str, float], FloatArray], field_nm: float) -> Figure:
-    """Draw figure 2a: one row per scheme, each with its own grey scale."""
-    schemes = list(dict.fromkeys(scheme for scheme, _ in images))
-    heights = list(dict.fromkeys(z for _, z in images))
-    figure = new_figure(1.75 * len(heights) + 1.3, 1.75 * len(schemes) + 0.4)
-    grid = figure.subplots(len(schemes), len(heights), squeeze=False)
-    half = field_nm / 2000
-    for row, scheme in enumerate(schemes):
-        low = min(float(images[scheme, z].min()) for z in heights)
-        high = max(float(images[scheme, z].max()) for z in heights)
-        for column, z in enumerate(heights):
-            axes = grid[row, column]
-            style: Style = {"cmap": "gray", "vmin": low, "vmax": high}
-            extent = (-half, half, -half, half)
-            shown = axes.imshow(images[scheme, z], interpolation="nearest", extent=extent, **style)
-            axes.set(xticks=[], yticks=[])
-            axes.spines[:].set_visible(False)
-            if row == 0:
-                axes.set_title(f"z = {z / 1000:g} µm", loc="center")
-        grid[row, 0].set_ylabel(SCHEMES[scheme].title)
-        bar = figure.colorbar(shown, ax=grid[row, :], shrink=0.85, pad=0.01, aspect=14)
-        bar.ax.ticklabel_format(axis="y", scilimits=(-2, 3))
-        bar.outline.set_visible(False)
-    grid[-1, 0].plot([-half + 0.3, -half + 1.3], [-half + 0.35] * 2, color="white", lw=2.5)
-    words: Style = {"color": "white", "ha": "center", "fontsize": 8}
-    grid[-1, 0].text(-half + 0.8, -half + 0.5, "1 µm", va="bottom", path_effects=HALO, **words)
-    return figure
+def images_chart(images: Mapping[tuple[str, float], FloatArray], field_nm: float) -> Chart:
+    """Show figure 2a: one row per scheme, each with its own grey scale."""
+    ends = {
+        scheme: (min(float(i.min()) for i in own), max(float(i.max()) for i in own))
+        for scheme in dict.fromkeys(scheme for scheme, _ in images)
+        for own in [[image for (name, _), image in images.items() if name == scheme]]
+    }
+    shown = [
+        (f"{SCHEMES[scheme].title}, z = {z / 1000:g} µm", image, ends[scheme])
+        for (scheme, z), image in images.items()
+    ]
+    greys = "; ".join(with_ends(SCHEMES[name].title, *both) for name, both in ends.items())
+    words = {"columns": len(images) // len(ends), "greys": greys}
+    return pictures("images", shown, field_nm / 2000, words)
 
 
-def table_figure(table: pd.DataFrame) -> Figure:
-    """Draw Table 1."""
-    figure, axes = one_panel(7.4, 3.0)
-    rows = table[table["unit"] == "nm"]
-    colors = (GREY, GREY, INK, BLUE, VERMILLION)
-    for number, (key, mark, color) in enumerate(zip(WAYS, "sx+oD", colors, strict=True)):
-        at = np.arange(len(rows)) + 0.13 * (number - 2)
-        axes.plot(rows[key], at, mark, color=color, label=WAYS[key], ms=6, mew=1.4)
-    for y, (printed, exact) in enumerate(zip(rows["printed"], rows["exact"], strict=True)):
-        words = f"printed {printed:g}\nexact {exact:.1f}"
-        beside: Style = {"va": "center", "transform": axes.get_yaxis_transform()}
-        axes.text(1.02, y, words, fontsize=8, **beside)
-    axes.set_yticks(range(len(rows)), [QUANTITY_LABELS[q].split(" [")[0] for q in rows["quantity"]])
-    axes.invert_yaxis()
-    axes.set_xlim(15, 150)
-    plain_log(axes, "x")
-    axes.set_xlabel("quantum bound of one collected photon [nm]")
-    axes.grid(axis="x", color=GRID, lw=0.8)
-    axes.set_axisbelow(True)
-    legend(figure, where="lower center", columns=3)
-    return figure
+def table_chart(table: pd.DataFrame) -> Chart:
+    """Show Table 1."""
+    rows = [
+        interval(
+            QUANTITY_LABELS[row["quantity"]].split(" [")[0], row[key], series=label, lane=label
+        )
+        for row in table[table["unit"] == "nm"].to_dict("records")
+        for key, label in WAYS.items()
+    ]
+    return intervals("table-1", rows)

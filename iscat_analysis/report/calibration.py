@@ -5,12 +5,10 @@ Everything arrives as what the JSON files hold; nothing is computed here.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from iscat_analysis.optics.waves import Template
 from iscat_analysis.report.numbers import (
@@ -32,24 +30,15 @@ from iscat_analysis.report.page import (
     OPTICS_FILE,
     Chart,
     Section,
-    configuration,
-    notes_section,
-    render_document,
-)
-from iscat_analysis.report.style import (
-    BLUE,
-    GREY,
-    INK,
-    VERMILLION,
-    Style,
     around,
-    floats,
-    one_panel,
-    picture,
-    publish,
-    row_of_panels,
-    whiskers,
-    whole_numbers,
+    configuration,
+    curves,
+    heatmap,
+    marks,
+    notes_section,
+    pictures,
+    render_document,
+    with_ends,
 )
 from iscat_analysis.units import count
 
@@ -59,52 +48,6 @@ _SOURCES = {
     "given": "as given",
     "flicker": "from the laser's flicker",
     "line": "o − σ_r²/g: where the variance would vanish",
-}
-_CAPTIONS = {
-    "transfer": (
-        "Photon transfer",
-        "Variance of a pixel against its mean, in bins of pixels; the slope is one over the gain.",
-    ),
-    "averaging": (
-        "Noise against averaging",
-        "Contrast noise between two successive averages of n frames. Shot noise falls as one over "
-        "the root of n; drift and particles do not.",
-    ),
-    "standards": (
-        "The line through the standards",
-        "Contrast of landing without its sign; the band holds 95 % of the line.",
-    ),
-    "peaks": (
-        "The peaks",
-        "|Contrast| of the landing events, and the peaks fitted to the events themselves.",
-    ),
-    "average": (
-        "Average particle",
-        "Measured, by the microscope that was found, and their difference in standard deviations "
-        "of the average.",
-    ),
-    "radial": (
-        "Radial profile",
-        "Average contrast on rings around the particle, with 95 % intervals, and the microscope "
-        "that was found.",
-    ),
-    "pupil": ("Pupil", "Aberrations without the focus, and the amplitude that the mask passes."),
-    "p-values": (
-        "Pictures that were not fitted",
-        "Their p-values; uniform where the microscope describes them.",
-    ),
-    "correlation": (
-        "Correlation of the errors",
-        "1 and −1: only a combination of the two is known.",
-    ),
-    "template": (
-        "Template",
-        "Contrast of a faint particle, its largest magnitude 1, and its standard deviation.",
-    ),
-    "held-out": (
-        "Pictures that were held out",
-        "Their p-values; uniform where the template describes them.",
-    ),
 }
 _LABELS = {
     "focus_nm": ("focus", "nm"),
@@ -143,20 +86,12 @@ _STATES = {
 }
 
 
-def _charts(figures: Iterator[tuple[str, Figure]]) -> list[Chart]:
-    """Put figures on the page, those wide whose images stand side by side."""
-    return [
-        Chart(name, _CAPTIONS[name][0], svg, _CAPTIONS[name][1], name in ("average", "template"))
-        for name, svg in publish(figures).items()
-    ]
-
-
 # ---- Camera --------------------------------------------------------------------------------------
 
 
 def camera_page(title: str, found: Mapping[str, Any], toml: str) -> str:
     """Make the page of a camera calibration."""
-    facts, charts = _camera_facts(found), _charts(_camera_figures(found))
+    facts, charts = _camera_facts(found), list(_camera_charts(found))
     camera = Section("camera", "Camera", sentence(found["verdict"]), facts, charts)
     notes = notes_section("notes", "Notes", found["notes"])
     sections = [camera, *notes, configuration(toml, _PASTED)]
@@ -187,25 +122,17 @@ def _camera_facts(found: Mapping[str, Any]) -> list[Fact]:
     return [*facts, Fact("Pixels left out", str(sum(masked.values())), note=reasons)]
 
 
-def _camera_figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
+def _camera_charts(found: Mapping[str, Any]) -> Iterator[Chart]:
     curve, noise = found["photon_transfer"], found["noise"]
     if curve.get("mean_adu"):
-        figure, axes = one_panel(6.2, 3.4)
-        axes.plot(curve["mean_adu"], floats(curve["fit_adu2"]), color=INK, label="fit")
-        variance, reach = floats(curve["variance_adu2"]), 1.96 * floats(curve["variance_se"])
-        style: Style = {"ms": 3, "color": VERMILLION, "label": "pixels, 95 %"}
-        whiskers(axes, curve["mean_adu"], variance, around(variance, reach), style=style)
-        axes.set(xlabel="mean [counts]", ylabel="variance [counts²]")
-        axes.legend()
-        yield "transfer", figure
+        at, variance = curve["mean_adu"], curve["variance_adu2"]
+        ends = around(variance, 1.96 * np.asarray(curve["variance_se"], float))
+        points = marks("point", "pixels, 95 %", at, variance, ends)
+        yield curves("transfer", [points, marks("line", "fit", at, curve["fit_adu2"])])
     if noise.get("n_frames"):
-        figure, axes = one_panel(6.2, 3.4)
-        axes.plot(noise["n_frames"], floats(noise["shot_noise"]), color=INK, label="shot noise")
-        dots: Style = {"color": VERMILLION, "ms": 4, "label": "measured"}
-        axes.plot(noise["n_frames"], noise["contrast_noise"], "o", **dots)
-        axes.set(xscale="log", yscale="log", xlabel="frames averaged", ylabel="contrast noise")
-        axes.legend()
-        yield "averaging", figure
+        at, shot = noise["n_frames"], noise["shot_noise"]
+        points = marks("point", "measured", at, noise["contrast_noise"])
+        yield curves("averaging", [points, marks("line", "shot noise", at, shot)])
 
 
 # ---- Standards -----------------------------------------------------------------------------------
@@ -227,39 +154,30 @@ def mass_page(title: str, found: Mapping[str, Any], toml: str) -> str:
         Fact("χ² of the line", number(found["chi2"]), note=freedom),
         Fact("Largest residual", number(largest, 2), "%"),
     ]
-    charts, tables = _charts(_mass_figures(found)), [_standards_table(standards)]
+    charts, tables = list(_mass_charts(found)), [_standards_table(standards)]
     line = Section("line", "Contrast against mass", lead, facts, charts, tables)
     notes = notes_section("notes", "Notes", found["notes"])
     sections = [line, *notes, configuration(toml, _PASTED)]
     return render_document(title, "Mass calibration from standards", sections)
 
 
-def _mass_figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
+def _mass_charts(found: Mapping[str, Any]) -> Iterator[Chart]:
     standards, histogram = found["standards"], found["histogram"]
     sign = -1.0 if found["landing"] == "dark" else 1.0
     masses, contrasts, errors = (
         np.array([s[name] for s in standards]) for name in ("mass_kda", "contrast", "contrast_se")
     )
-    contrasts, reach = np.abs(contrasts), 1.96 * errors
+    contrasts = np.abs(contrasts)
     grid = np.linspace(0, 1.1 * masses.max(), 61)
     (vs, cov), (_, vo) = found["covariance"]
     line = sign * (found["gradient_per_kda"] * grid + found["offset"])
     band = 1.96 * np.sqrt(np.maximum(grid**2 * vs + 2 * grid * cov + vo, 0.0))
-    figure, axes = one_panel(6.2, 3.4)
-    axes.plot(grid, line, color=INK, label="line, 95 %")
-    axes.fill_between(grid, line - band, line + band, color=GREY, alpha=0.35, lw=0)
-    style: Style = {"color": VERMILLION, "label": "standards, 95 %"}
-    whiskers(axes, masses, contrasts, around(contrasts, reach), style=style)
-    axes.set(xlabel="mass [kDa]", ylabel="|contrast|")
-    axes.legend()
-    yield "standards", figure
-    figure, axes = one_panel(6.2, 3.4)
-    axes.stairs(histogram["counts"], histogram["edges"], fill=True, color=GREY, label="events")
-    for k, contrast in enumerate(contrasts):
-        axes.axvline(contrast, color=VERMILLION, ls="--", label=None if k else "standards")
-    whole_numbers(axes, "|contrast|")
-    axes.legend()
-    yield "peaks", figure
+    known = around(contrasts, 1.96 * errors)
+    points = marks("point", "standards, 95 %", masses, contrasts, known)
+    reach = marks("band", "line, 95 %", grid, ends=around(line, band))
+    yield curves("standards", [points, reach, marks("line", "line, 95 %", grid, line)])
+    bars = marks("bar", "events", histogram["edges"], histogram["counts"])
+    yield curves("peaks", [bars, marks("rule", "standards", contrasts)])
 
 
 def _standards_table(standards: list[Mapping[str, Any]]) -> Table:
@@ -307,7 +225,7 @@ def optics_page(title: str, found: Mapping[str, Any], toml: str) -> str:
     unknown = found["notes"] or ["Everything that was asked for was determined"]
     sections = [
         Section("verdict", "The microscope", verdict, facts, tables=tables),
-        Section("pictures", "Pictures", charts=_charts(_optics_figures(found))),
+        Section("pictures", "Pictures", charts=list(_optics_charts(found))),
         *notes_section("unknown", "What could not be known", unknown),
         configuration(toml, OPTICS_FILE),
     ]
@@ -318,65 +236,44 @@ def _verdict(found: Mapping[str, Any], accepted: str) -> str:
     return accepted if found["accepted"] else f"Refused: {'; '.join(found['refusals'])}."
 
 
-def _optics_figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
-    """Draw what the page shows."""
-    pictures = found["pictures"]
+def _optics_charts(found: Mapping[str, Any]) -> Iterator[Chart]:
+    shown = found["pictures"]
     measured, model, residual, wavefront, passed = (
-        np.asarray(pictures[key], dtype=float)
+        np.asarray(shown[key], dtype=float)
         for key in ("measured", "model", "residual", "wavefront_nm", "transmission")
     )
-    half, top = measured.shape[0] * pictures["pixel_nm"] / 2000, float(np.abs(measured).max())
-    figure, panels = row_of_panels(3, 3.0, 2.9)
-    picture(panels[0], measured, half, (-top, top), "measured")
-    picture(panels[1], model, half, (-top, top), "model")
-    far = max(3.0, float(np.abs(residual).max()))
-    picture(panels[2], residual, half, (-far, far), "residual [σ]")
-    _name_axes(panels, "x [µm]", "y [µm]")
-    yield "average", figure
-    yield "radial", _radial(pictures)
-    figure, panels = row_of_panels(2, 3.1, 2.9)
-    far, na = max(1.0, float(np.nanmax(np.abs(wavefront)))), pictures["na"]
-    picture(panels[0], wavefront, na, (-far, far), "wavefront [nm]")
-    picture(panels[1], passed, na, (0.0, 1.0), "amplitude passed", style={"cmap": "cividis"})
-    _name_axes(panels, "NA along x", "NA along y")
-    yield "pupil", figure
-    yield "p-values", _p_values(found["held_out"]["p_values"])
-    yield "correlation", _correlation(found["names"], found["correlation"])
+    top, far = float(np.abs(measured).max()), max(3.0, float(np.abs(residual).max()))
+    half = measured.shape[0] * shown["pixel_nm"] / 2000
+    images = [
+        (with_ends("measured", -top, top), measured, (-top, top)),
+        ("model", model, (-top, top)),
+        (with_ends("residual [σ]", -far, far), residual, (-far, far)),
+    ]
+    yield pictures("average", images, half)
+    radius, ends = shown["radius_nm"], around(shown["radial"], 1.96 * np.array(shown["radial_se"]))
+    points = marks("point", "measured, 95 %", radius, shown["radial"], ends)
+    yield curves("radial", [points, marks("line", "model", radius, shown["radial_model"])])
+    yield _p_values("p-values", found["held_out"]["p_values"])
+    far = max(1.0, float(np.nanmax(np.abs(wavefront))))
+    images = [
+        (with_ends("wavefront [nm]", -far, far), wavefront, (-far, far)),
+        (with_ends("amplitude", 0.0, 1.0), passed, (0.0, 1.0)),
+    ]
+    yield pictures("pupil", images, shown["na"])
+    names = [_LABELS.get(name, (name, ""))[0].split(",")[0] for name in found["names"]]
+    known = np.asarray(found["correlation"], dtype=float).reshape(len(names), len(names))
+    cells = [
+        {"panel": "", "row": one, "column": other, "value": value, "text": ""}
+        for one, line in zip(names, known.tolist(), strict=True)
+        for other, value in zip(names, line, strict=True)
+    ]
+    if cells:
+        yield heatmap("correlation", cells)
 
 
-def _name_axes(panels: Sequence[Axes], x: str, y: str) -> None:
-    for axes in panels:
-        axes.set_xlabel(x)
-    panels[0].set_ylabel(y)
-
-
-def _radial(pictures: Mapping[str, Any]) -> Figure:
-    figure, axes = one_panel(4.6, 3.0)
-    radius, mean, se = (np.array(pictures[k]) for k in ("radius_nm", "radial", "radial_se"))
-    axes.plot(radius, pictures["radial_model"], color=BLUE, label="model")
-    style: Style = {"fmt": ".", "color": VERMILLION, "label": "measured, 95 %"}
-    whiskers(axes, radius, mean, around(mean, 1.96 * se), style=style)
-    axes.set(xlabel="distance [nm]", ylabel="contrast")
-    axes.legend()
-    return figure
-
-
-def _p_values(p_values: list[float]) -> Figure:
-    figure, axes = one_panel(4.6, 3.0)
-    axes.hist(p_values, bins=10, range=(0.0, 1.0), color=VERMILLION)
-    whole_numbers(axes, "p-value", "pictures")
-    return figure
-
-
-def _correlation(names: list[str], correlation: list[list[float]]) -> Figure:
-    figure, axes = one_panel(4.6, 3.8)
-    matrix = np.asarray(correlation, dtype=float).reshape(len(names), len(names))
-    shown = axes.imshow(matrix, cmap="RdBu_r", vmin=-1, vmax=1)
-    labels = [_LABELS.get(name, (name, ""))[0].split(",")[0] for name in names]
-    axes.set_xticks(range(len(names)), labels, rotation=60, ha="right")
-    axes.set_yticks(range(len(names)), labels)
-    figure.colorbar(shown, ax=axes, shrink=0.8)
-    return figure
+def _p_values(name: str, values: list[float]) -> Chart:
+    counts, edges = np.histogram(values, bins=10, range=(0.0, 1.0))
+    return curves(name, [marks("bar", "pictures", edges, counts)])
 
 
 def _parameters(parameters: list[Mapping[str, Any]]) -> Table:
@@ -416,19 +313,18 @@ def template_page(title: str, found: Mapping[str, Any], template: Template, toml
     verdict = _verdict(found, "The template describes pictures that were held out.")
     sections = [
         Section("verdict", "The picture", verdict, facts),
-        Section("pictures", "Pictures", charts=_charts(_template_figures(found, template))),
+        Section("pictures", "Pictures", charts=list(_template_charts(found, template))),
         Section("meaning", "What it is for", notes=meaning),
         configuration(toml, OPTICS_FILE),
     ]
     return render_document(title, "Picture of a particle, measured", sections)
 
 
-def _template_figures(found: Mapping[str, Any], template: Template) -> Iterator[tuple[str, Figure]]:
-    half = template.contrast.shape[0] * template.step_nm / 2000
-    figure, panels = row_of_panels(2, 3.1, 2.9)
-    picture(panels[0], template.contrast, half, (-1.0, 1.0), "contrast")
-    ends, grown = (0.0, float(template.sigma.max())), {"cmap": "cividis"}
-    picture(panels[1], template.sigma, half, ends, "standard deviation", style=grown)
-    _name_axes(panels, "x [µm]", "y [µm]")
-    yield "template", figure
-    yield "held-out", _p_values(found["held_out"]["p_values"])
+def _template_charts(found: Mapping[str, Any], template: Template) -> Iterator[Chart]:
+    top = float(template.sigma.max())
+    images = [
+        (with_ends("contrast", -1.0, 1.0), template.contrast, (-1.0, 1.0)),
+        (with_ends("standard deviation", 0.0, top), template.sigma, (0.0, top)),
+    ]
+    yield pictures("template", images, template.contrast.shape[0] * template.step_nm / 2000)
+    yield _p_values("held-out", found["held_out"]["p_values"])

@@ -136,9 +136,9 @@ def percent(value: float | None, decimals: int | None = None) -> str:
     return f"{number(100 * value, 2) if decimals is None else fixed(100 * value, decimals)} %"
 
 
-def probability(p: float) -> str:
+def probability(p: float | None) -> str:
     """Write a p-value."""
-    return number(p, 2) if not p < 1e-6 else "0.000001 or less"
+    return number(p, 2) if p is None or not p < 1e-6 else "0.000001 or less"
 
 
 def with_interval(

@@ -31,16 +31,15 @@ OUTPUT_NAMES = frozenset(
 )
 """Everything `write_report` may leave in its folder."""
 
-BENCHMARK_NAMES = frozenset(
-    {"benchmark.json", "benchmark.html", "benchmark.bib", "config.toml", "figures"}
-)
+BENCHMARK_NAMES = frozenset({"benchmark.json", "benchmark.html", "benchmark.bib", "config.toml"})
 """Everything `write_benchmark` leaves in its folder."""
 
-CHALLENGE_NAMES = frozenset({"challenge.json", "challenge.html", "benchmark.bib", "figures"})
+CHALLENGE_NAMES = frozenset({"challenge.json", "challenge.html", "benchmark.bib"})
 """Everything the score of a challenge leaves in its folder."""
 
-_SUBJECTS = ("report", "batch", "camera", "calibration", "optics", "template", "benchmark")
-PAGES = tuple(f"{name}.html" for name in (*_SUBJECTS, "challenge", "comparison"))
+_CALIBRATIONS = ("camera", "calibration", "optics", "template")
+_ANSWERS = ("species", "comparison", "kd", "bounds", "benchmark", "challenge")
+PAGES = tuple(f"{name}.html" for name in ("report", "batch", *_CALIBRATIONS, *_ANSWERS))
 """Pages that the commands write."""
 
 _HEADING = "Files of iscat-analysis; what is not in this list is never removed."
@@ -362,7 +361,7 @@ def page_of(result: Path) -> Path:
     if is_folder(folder):
         raise DataError(
             f"{folder}: holds no page ({', '.join(PAGES)}); give the output folder of iscat fit, "
-            "batch, calibrate or benchmark"
+            "batch, calibrate, species, kd, bounds or benchmark"
         )
     if is_file(result):
         raise DataError(

@@ -128,6 +128,12 @@ def grey_png(image: FloatArray, longest: int) -> bytes:
     return png_of(shaded(parts.mean(axis=(1, 3)), 96), _ramp(_GREYS, 96))
 
 
+def picture_uri(image: FloatArray, low: float, high: float) -> str:
+    """Put an image into an address: greys between these ends, or colours on both sides of zero."""
+    ramp = _ramp(_DIVERGING if low == -high else _GREYS, 96)
+    return data_uri(png_of(shaded((image - low) / (high - low), 96), ramp))
+
+
 def data_uri(content: bytes, kind: str = "image/png") -> str:
     """Put a file into an address."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"

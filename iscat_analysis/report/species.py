@@ -1,201 +1,233 @@
-"""Species, sizes, samples beside each other and equilibria: their sections and figures.
+"""Pages of species, of samples beside each other and of equilibria, and their figures.
 
-Everything arrives as what ``summary.json`` and the documents of the commands hold; nothing is
-computed here.
+Everything arrives as what the documents of the commands hold; nothing is computed here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import PurePath
-from typing import Any, Literal
+from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
-from iscat_analysis.report.numbers import number
-from iscat_analysis.report.plots import contents, figure_of, plot_kd
-from iscat_analysis.report.style import (
-    BLUE,
-    GREY,
-    INK,
-    PURPLE,
-    STYLE,
-    VERMILLION,
-    Style,
-    floats,
-    new_figure,
-    one_panel,
-    whiskers,
+from iscat_analysis.report.numbers import (
+    Fact,
+    fixed,
+    number,
+    numeric,
+    of,
+    percent,
+    probability,
+    tabulate,
+    worded,
 )
-from iscat_analysis.text import in_figure
+from iscat_analysis.report.numbers import intervals as interval_columns
+from iscat_analysis.report.page import (
+    Chart,
+    Section,
+    curves,
+    interval,
+    intervals,
+    marks,
+    notes_section,
+    render_document,
+)
 
-PALETTES: Mapping[str, tuple[str, ...]] = {
-    "colour-blind safe": (BLUE, VERMILLION, PURPLE, "#009E73", "#E69F00", "#56B4E9"),
-    "greys": ("#000000", "#555555", "#888888", "#AAAAAA", "#333333", "#777777"),
-}
-"""Colours of samples, by name."""
-
-FONTS = ("sans-serif", "serif", "monospace")
-"""Families of letters."""
-
-Format = Literal["svg", "pdf", "png"]
-
-_NAMED = 12  # samples whose names fit beside an axis
 _CORRECTED = ("corrected_low", "corrected_high")
 
 
-# ---- Species of a movie --------------------------------------------------------------------------
+# ---- Species of a table --------------------------------------------------------------------------
 
 
-def species_figure(found: Mapping[str, Any]) -> Figure | None:
-    """Draw masses, species and the efficiency of their detection."""
+def species_page(found: Mapping[str, Any]) -> str:
+    """Make the page of the document ``species``."""
+    columns = (
+        *interval_columns("mass [kDa]", "mass_kda"),
+        *interval_columns("width [kDa]", "width_kda", title="beyond the events' own errors"),
+        numeric("events", of("count", fixed, 0), "that were seen"),
+        numeric("landing", of("landing", fixed, 0)),
+        numeric("leaving", of("leaving", fixed, 0)),
+        numeric("detected", of("efficiency", percent, 1), "chance to detect such a particle"),
+        *interval_columns("came", "count_corrected", _CORRECTED, title="with those missed"),
+        *interval_columns("fraction", "fraction", in_percent=True, title="of all that came"),
+    )
+    title = f"Species by mass; intervals from {found['draws']} simulated repetitions"
+    tables = [tabulate(found["species"], columns, title)]
+    charts = list(species_charts(found))
+    part = Section("species", "Species", _lead(found), charts=charts, tables=tables)
+    sections = [part, *notes_section("notes", "Notes", found["notes"])]
+    return render_document("Species by mass", found["source"], sections)
+
+
+def _lead(found: Mapping[str, Any]) -> str:
+    described = [item for item in found["species"] if not item.get("background")]
+    count = sum(not item["outlier"] for item in described)
+    rivals = [row["delta_bic"] for row in found["selection"] if row["species"] != len(described)]
+    text = (
+        f"{count} species explain {found['events']} events best (BIC), fitted to the events "
+        "themselves, each with its own error."
+        if count > 1
+        else f"One species explains {found['events']} events best (BIC)."
+    )
+    if count < len(described):
+        text += " What lies apart from them in one or two events is listed, and is no species."
+    for item in found["species"]:
+        if item.get("background"):
+            share = 100 * item["count"] / found["events"]
+            text += f" {share:.2g} % of the events are background, which is no species."
+    if rivals:
+        text += f" The next best number is worse by {number(min(rivals), 2)}."
+    if (support := found["support"]) is not None and support == support:
+        text += f" In {100 * support:.0f} % of simulated repetitions the same number wins."
+    return text
+
+
+def species_charts(found: Mapping[str, Any]) -> Iterator[Chart]:
+    """Show masses and species, and the chance of their detection."""
     if not found["species"]:
-        return None
-    curves = {name: floats(values) for name, values in found["curves"].items()}
-    mass, efficiency = curves["mass_kda"], curves["efficiency"]
-    missed = efficiency.min() < 1
-    figure = new_figure(9.6, 3.4)
-    panels = figure.subplots(1, 2, width_ratios=(2.2, 1)) if missed else [figure.add_subplot()]
-    width = _bars(panels[0], found["histogram"], "kda", "events")
-    density, error = width * curves["density"], width * curves["density_se"]
-    low, high = np.maximum(density - 1.96 * error, 0), density + 1.96 * error
-    panels[0].fill_between(mass, low, high, color=BLUE, alpha=0.2, lw=0)
-    panels[0].plot(mass, density, color=BLUE, lw=1, label="kernel density, 95 %")
-    panels[0].plot(mass, width * curves["model"], color=VERMILLION, lw=1.6, label="species")
-    panels[0].set(xlabel="|mass| [kDa]", ylabel=f"events per {width:g} kDa")
+        return
+    shape = {name: np.asarray(values, float) for name, values in found["curves"].items()}
+    mass, efficiency, bars = shape["mass_kda"], shape["efficiency"], found["histogram"]
+    low, high = bars["low_kda"], bars["high_kda"]
+    width = float(high[0] - low[0])
+    density, error = width * shape["density"], width * shape["density_se"]
+    ends = [np.maximum(density - 1.96 * error, 0), density + 1.96 * error]
+    smooth, missed = "kernel density, 95 %", efficiency.min() < 1
+    rungs = [rung["mass_kda"] for rung in found["species"] if rung.get("n")]
+    parts = [
+        marks("bar", "events", [*low, high[-1]], bars["count"]),
+        marks("line", "species", mass, width * shape["model"]),
+        marks("band", smooth, mass, ends=ends),
+        marks("line", smooth, mass, density),
+        *([marks("rule", "steps of the ladder", rungs)] if rungs else []),
+    ]
     if missed:
-        corrected = width * curves["model_corrected"]
-        panels[0].plot(mass, corrected, "--", color=PURPLE, label="corrected for what was missed")
-        panels[1].plot(mass, efficiency, color=INK)
+        corrected, label = width * shape["model_corrected"], "corrected for what was missed"
+        parts.append(marks("line", label, mass, corrected, dash="dashed"))
+    yield curves("species", parts, {"width": f"{width:g}"})
+    if missed:
         known = [s for s in found["species"] if not s.get("background")]
-        at = [s["mass_kda"] for s in known]
-        panels[1].plot(at, [s["efficiency"] for s in known], "o", color=VERMILLION)
-        panels[1].set(xlabel="|mass| [kDa]", title="Chance of detection", ylim=(0, 1.05))
-    for rung in found["species"]:
-        if rung.get("n"):
-            panels[0].axvline(rung["mass_kda"], color=GREY, lw=0.8, ls=":", zorder=0)
-            place: Style = {"xycoords": ("data", "axes fraction"), "ha": "center"}
-            panels[0].annotate(str(rung["n"]), (rung["mass_kda"], 1), va="bottom", **place)
-    panels[0].legend(loc="best")  # named, because Matplotlib warns where its own choice is slow
-    return figure
-
-
-def _bars(axes: Axes, bars: Mapping[str, Any], unit: str, label: str) -> float:
-    """Draw a histogram of a document; give the width of its bins."""
-    low, high = bars[f"low_{unit}"], bars[f"high_{unit}"]
-    edges = [*low, high[-1]]
-    axes.stairs(bars["count"], edges, fill=True, color=GREY, alpha=0.5, label=label)
-    return float(high[0] - low[0])
+        at, chance = ([s[name] for s in known] for name in ("mass_kda", "efficiency"))
+        points = marks("point", "species", at, chance)
+        yield curves("detection", [points, marks("line", "all masses", mass, efficiency)])
 
 
 # ---- Samples and equilibria ----------------------------------------------------------------------
 
 
-def comparison_figure(
-    found: Mapping[str, Any], histograms: Sequence[Mapping[str, Any]]
-) -> Iterator[tuple[str, Figure]]:
-    """Draw mass distributions over each other, shifts and differences of fractions."""
+def comparison_page(found: Mapping[str, Any], histograms: Sequence[Mapping[str, Any]]) -> str:
+    """Make the page of the document ``species_comparison``."""
     pairs = found["comparisons"]
-    figure = new_figure(11.5, max(3.4, 1.6 + 0.3 * min(len(pairs), _NAMED)))
-    left, middle, right = figure.subplots(1, 3, width_ratios=(1.8, 1, 1))
-    colours = (GREY, VERMILLION, BLUE, PURPLE)
-    for place, drawn in enumerate(histograms):
-        style: Style = {"color": colours[place % 4], "alpha": 0.9 if place else 0.5}
-        name = _short(drawn["source"])
-        left.stairs(drawn["share"], drawn["edges"], fill=not place, lw=1.2, label=name, **style)
-    width = histograms[0]["edges"][1] - histograms[0]["edges"][0]
-    left.set(xlabel="|mass| [kDa]", ylabel=f"share of events per {number(width, 2)} kDa")
-    left.legend()
-    _intervals(middle, pairs, ("shift_kda", "shift_low", "shift_high"), "shift [kDa]")
-    differences = ("difference", "difference_low", "difference_high")
-    _intervals(right, pairs, differences, "difference of fractions")
-    right.set_yticklabels([])
-    right.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    right.locator_params(axis="x", nbins=5)
-    yield "comparison", figure
+    names = _named([found["source"], *(pair["source"] for pair in pairs)])
+    tests = {"same": "one sample", "same_masses": "same masses", "same_fractions": "same fractions"}
+
+    def chance(name: str) -> Any:
+        return lambda row: probability(row[name]["p_value"])
+
+    columns = (
+        worded("sample", of("source", names.get)),
+        *(numeric(f"p, {label}", chance(name)) for name, label in tests.items()),
+    )
+    tables = [tabulate(pairs, columns, f"Compared with {names[found['source']]}")]
+    charts = list(comparison_charts(pairs, histograms))
+    part = Section("comparison", "Comparison", charts=charts, tables=tables)
+    sections = [part, *notes_section("notes", "Notes", found["notes"])]
+    return render_document("Samples beside each other", found["source"], sections)
 
 
-def _intervals(
-    axes: Axes, pairs: Sequence[Mapping[str, Any]], names: tuple[str, str, str], label: str
-) -> None:
-    """Draw one point with its 95 % interval for each sample and species."""
-    kinds = len(pairs[0]["species"])
-    for i in range(kinds):
-        colour = (VERMILLION, BLUE, PURPLE, INK)[i % 4]
-        rows = [pair["species"][i] for pair in pairs]
-        at, low, high = (floats(row[name] for row in rows) for name in names)
-        places = np.arange(len(rows)) + 0.6 * ((i + 0.5) / kinds - 0.5)
-        style: Style = {"ms": 3.5, "color": colour, "label": f"{number(rows[0]['mass_kda'])} kDa"}
-        whiskers(axes, places, at, (low, high), along="x", style=style)
-    axes.axvline(0, color=GREY, lw=0.8)
-    axes.set(xlabel=f"{label}, 95 %", ylim=(len(pairs) - 0.5, -0.5))
-    if len(pairs) <= _NAMED:
-        axes.set_yticks(range(len(pairs)), [_short(pair["source"]) for pair in pairs])
-    else:
-        axes.set_ylabel("sample")
+def comparison_charts(
+    pairs: Sequence[Mapping[str, Any]], histograms: Sequence[Mapping[str, Any]]
+) -> Iterator[Chart]:
+    """Show mass distributions over each other, shifts and differences of fractions."""
+    names = _named([one["source"] for one in (*histograms, *pairs)])
+    edges = np.asarray(histograms[0]["edges"], float)
+    middles, width = (edges[1:] + edges[:-1]) / 2, edges[1] - edges[0]
+    reference, *others = histograms
+    parts = [marks("bar", names[reference["source"]], edges, reference["share"])]
+    parts += [marks("line", names[one["source"]], middles, one["share"]) for one in others]
+    yield curves("compared", parts, {"width": number(width, 2)})
+    for name, key in (("shifts", "shift_kda"), ("fractions", "difference")):
+        stem = key.removesuffix("_kda")
+        rows = [
+            interval(
+                names[pair["source"]],
+                one[key],
+                (one[f"{stem}_low"], one[f"{stem}_high"]),
+                series=f"{number(one['mass_kda'])} kDa",
+                lane=f"{k:02d}",
+            )
+            for pair in pairs
+            for k, one in enumerate(pair["species"])
+        ]
+        yield intervals(name, rows)
 
 
-def _short(source: str) -> str:
-    """Name a table by its folder where the file is named as all are."""
-    path = PurePath(source)
-    name = path.parent.name if path.stem == "fits" and path.parent.name else path.name
-    return in_figure(name if len(name) <= 24 else f"{name[:23]}…")
+def _named(sources: Sequence[str]) -> dict[str, str]:
+    """Name tables by their files, or folders where the file is named as all are."""
+    paths = {source: PurePath(source) for source in sources}
+    names = {
+        source: path.parent.name if path.stem == "fits" and path.parent.name else path.name
+        for source, path in paths.items()
+    }
+    return names if len(set(names.values())) == len(names) else {one: one for one in names}
 
 
-def binding_figure(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
-    """Draw fractions of complexes with their intervals, the equilibrium and the profile."""
-    yield "kd", figure_of(plot_kd(found))
+def binding_page(found: Mapping[str, Any]) -> str:
+    """Make the page of the document ``kd``."""
+    _, reaction, complexes = _REACTIONS[found["model"]]
+    low, high = found["kd_low"], found["kd_high"]
+    ends = f"95 %: {number(low)} to {'∞' if high is None else number(high)}"
+    facts = [
+        Fact("K_D", number(found["kd_nm"]), "nM", ends),
+        Fact("Movies or tables", str(len(found["samples"]))),
+        Fact("Model", f"p = {probability(found['p_value'])}", note=reaction),
+    ]
+    totals = [key for key in ("concentration_nm", "a_nm", "b_nm") if key in found["samples"][0]]
+    names = _named([row["path"] for row in found["samples"]])
+    columns = (
+        worded("table", of("path", names.get)),
+        *(numeric(key.replace("_nm", " [nM]"), of(key)) for key in totals),
+        numeric("events", of("events", fixed, 0)),
+        *interval_columns(complexes, "complexes", in_percent=True),
+        numeric("by K_D", of("predicted", percent)),
+        numeric("pull", of("pull", number, 2), "distance in standard errors"),
+    )
+    tables = [tabulate(found["samples"], columns, f"Share of {complexes} among the particles")]
+    part = Section("kd", "Equilibrium", "", facts, list(binding_charts(found)), tables)
+    sections = [part, *notes_section("notes", "Notes", found["notes"])]
+    return render_document("Equilibrium constant", found["source"], sections)
 
 
-# ---- A histogram with its gates, for the app -----------------------------------------------------
+_REACTIONS = {"dimer": ("monomers", "2 M ⇌ D", "dimers"), "ab": ("A and B", "A + B ⇌ AB", "AB")}
 
 
-def histogram_figure(
-    samples: Sequence[tuple[str, Any]],
-    *,
-    size_cm: tuple[float, float] = (12.0, 8.0),
-    font: tuple[str, float] = ("sans-serif", 9.0),
-    palette: str = "colour-blind safe",
-    gates: Sequence[Any] = (),
-    curve: tuple[Any, Any] | None = None,
-    density: bool = True,
-) -> Figure:
-    """Draw histograms over each other, shaded gates, and the curve of the species.
-
-    A sample is its name and a `MassHistogram`; several are drawn as shares.  The font has a family
-    and a size [pt].
-    """
-    colours = PALETTES[palette]
-    shares = len(samples) > 1
-    with mpl.rc_context({**STYLE, "font.family": font[0], "font.size": font[1]}):
-        figure, axes = one_panel(*(side / 2.54 for side in size_cm))
-        for place, (name, mass) in enumerate(samples):
-            scale = 1.0 / max(mass.counts.sum(), 1.0) if shares else 1.0
-            colour = colours[place % len(colours)]
-            style: Style = {"color": colour if shares else GREY, "alpha": 0.9 if shares else 0.45}
-            axes.stairs(mass.counts * scale, mass.edges, fill=not shares, label=name, **style)
-            if density:
-                axes.plot(mass.mass_kda, mass.density * scale, color=colour, lw=1.2)
-        if curve is not None:
-            axes.plot(*map(np.asarray, curve), color=VERMILLION, lw=1.6, label="species")
-        for each in gates:
-            axes.axvspan(each.low_kda, each.high_kda, color=BLUE, alpha=0.12, lw=0)
-            text = f"{each.mean_kda:.0f} kDa\n{each.count}"
-            middle = ((each.low_kda + each.high_kda) / 2, 0.98)
-            place_of: Style = {"xycoords": ("data", "axes fraction"), "ha": "center"}
-            axes.annotate(text, middle, color=INK, va="top", **place_of)
-        bar = samples[0][1].bin_kda if samples else 1.0
-        label = "share of events" if shares else "events"
-        axes.set(xlabel="|mass| [kDa]", ylabel=f"{label} per {bar:g} kDa")
-        axes.set(xlim=(0, None), ylim=(0, None))
-        if shares or curve is not None:
-            axes.legend(loc="best")
-    return figure
-
-
-def figure_bytes(figure: Figure, kind: Format, *, dpi: int = 300) -> bytes:
-    """Write a figure as a file's contents."""
-    return contents(figure, kind, dpi)
+def binding_charts(found: Mapping[str, Any], of: str = "", condition: str = "") -> Iterator[Chart]:
+    """Show fractions of complexes with their intervals, the equilibrium and the profile."""
+    partners, _, complexes = _REACTIONS[found["model"]]
+    dimer, rows = found["model"] == "dimer", found["samples"]
+    at = [row["concentration_nm"] if dimer else row["a_nm"] + row["b_nm"] for row in rows]
+    share, low, high, predicted = (
+        np.array([row.get(key) for row in rows], float)
+        for key in ("complexes", "complexes_low", "complexes_high", "predicted")
+    )
+    known = found["curve"]
+    line = (
+        marks("line", "equilibrium", known["concentration_nm"], known["complexes"])
+        if dimer
+        else marks("point", "equilibrium", at, predicted)
+    )
+    words = {"title": f"K_D, {condition}" if condition else "K_D", "partners": partners}
+    points = marks("point", "tables, 95 %", at, share, [low, high])
+    yield curves("kd", [points, line], {**words, "complexes": complexes}, of=of)
+    limit, best = 3.84, found["kd_nm"]
+    log_kd, lost = (np.asarray(found["profile"][key], float) for key in ("ln_kd_nm", "deviance"))
+    inside = lost <= 2.2 * limit
+    kd, lost = np.exp(log_kd[inside]), lost[inside]
+    parts = [marks("point", "profile", kd, lost), marks("rule", "best", [best])]
+    if kd.size > 1:
+        root = np.sign(kd - best) * np.sqrt(lost)
+        fine = np.geomspace(kd[0], kd[-1], 100)
+        parts.append(marks("line", "profile", fine, np.interp(np.log(fine), np.log(kd), root) ** 2))
+        parts.append(marks("line", "95 %", kd[[0, -1]], [limit] * 2, dash="dashed"))
+    yield curves("profile", parts, {**words, "span": [0, 2.2 * limit]}, of=of)

@@ -100,8 +100,8 @@ def figure(
     A layer whose data set has no rows is left out.
     """
     empty = {key for key, columns in data.items() if not any(map(len, columns.values()))}
-    filled = _filled(_read(name), words or {})
-    return VegaFigure(name, _without(filled, empty), {k: data[k] for k in data if k not in empty})
+    whole = filled(_read(name), words or {})
+    return VegaFigure(name, _without(whole, empty), {k: data[k] for k in data if k not in empty})
 
 
 def _without(part: Any, empty: Collection[str]) -> Any:
@@ -123,15 +123,14 @@ def described(drawn: VegaFigure, sentence: str) -> VegaFigure:
     return replace(drawn, specification={**drawn.specification, "description": sentence})
 
 
-def _filled(part: Any, words: Mapping[str, Any]) -> Any:
+def filled(part: Any, words: Mapping[str, Any]) -> Any:
     """Replace ``"$name"`` by a value of any kind, and ``$name`` within a text by its text."""
     if isinstance(part, Mapping):
-        return {key: _filled(value, words) for key, value in part.items()}
+        return {key: filled(value, words) for key, value in part.items()}
     if isinstance(part, list):
-        return [_filled(value, words) for value in part]
+        return [filled(value, words) for value in part]
     if isinstance(part, str) and "$" in part:
-        whole = words.get(part[1:])
-        return Template(part).substitute(words) if whole is None else whole
+        return words[part[1:]] if part[1:] in words else Template(part).substitute(words)
     return part
 
 
@@ -142,6 +141,12 @@ def _text(name: str) -> str:
 
 def _read(name: str) -> dict[str, Any]:
     found: dict[str, Any] = json.loads(_text(f"specifications/{name}.vl.json"))
+    return found
+
+
+def look_of(name: str, words: Mapping[str, Any]) -> dict[str, Any]:
+    """Give title, axes and looks of a figure that is drawn by a general specification."""
+    found: dict[str, Any] = filled(json.loads(_text("specifications/figures.json"))[name], words)
     return found
 
 

@@ -8,7 +8,7 @@ import pytest
 
 import iscat_analysis as ia
 from iscat_analysis.answers.gates import counted_rows, gate, mass_histogram, usual_bin
-from iscat_analysis.report.species import figure_bytes, histogram_figure
+from iscat_analysis.report.style import figure_bytes, histogram_figure
 
 
 @pytest.fixture

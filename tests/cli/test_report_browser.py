@@ -21,7 +21,6 @@ from iscat_analysis.records import EVENT_COLUMNS
 from iscat_analysis.report import render_report
 from iscat_analysis.report.numbers import Fact, numeric, tabulate, worded
 from iscat_analysis.report.page import Chart, Section, render_document
-from iscat_analysis.report.style import publish
 from iscat_analysis.report.vega import figure
 from iscat_cli import main
 
@@ -29,7 +28,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from batch_factory import make_batch_page
 from browsers import BROWSER, DRIVER, open_browser
 from report_factory import make_analysis, without_events
-from sketches import PAGES
 
 pytestmark = pytest.mark.skipif(
     BROWSER is None or DRIVER is None,
@@ -117,8 +115,6 @@ def written(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper, "HEIGHTS_NM", np.linspace(0.0, 1000.0, 3))
         patch.setattr(paper, "FOCI_NM", np.linspace(-1000.0, 1000.0, 3))
-        for module in PAGES:  # no files of figures, which no page shows
-            patch.setattr(module, "publish", lambda figures, *_, **__: publish(figures))
         for arguments in (
             ["simulate", *few, "--out", str(landing)],
             ["fit", str(landing), *few, "--inject", "2", "--out", str(folder / "landing")],
@@ -226,7 +222,8 @@ def drawn(browser: Any) -> dict[str, int]:
     script = """
     const done = arguments[0];
     document.querySelectorAll("details").forEach((part) => { part.open = true; });
-    const count = (node) => node.querySelectorAll("svg path, svg image, canvas").length;
+    const count = (node) => node.querySelector("canvas") ? 2
+      : node.querySelectorAll("svg path, svg image").length;
     requestAnimationFrame(() => requestAnimationFrame(() => iscat.drawAll().then(() => done(
       Object.fromEntries([...document.querySelectorAll("[data-figure]")].map((node) =>
         [node.dataset.figure, count(node)]))))));

@@ -7,8 +7,8 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+import pandas as pd
 import pytest
-from matplotlib.collections import LineCollection
 from microscopes import configuration, setting
 from sketches import sketch_figures
 
@@ -16,7 +16,8 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.posterior import van_trees
 from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.report import BENCHMARK_NAMES, render_benchmark
-from iscat_analysis.report.benchmark import benchmark_figures
+from iscat_analysis.report.benchmark import mode_charts
+from iscat_analysis.report.vega import figures_in
 from iscat_analysis.study import (
     make_setting,
     pull_histogram,
@@ -246,8 +247,8 @@ def test_study_is_written_whole(study: dict[str, object], tmp_path) -> None:
     assert {entry.name for entry in folder.iterdir()} == {*BENCHMARK_NAMES, ".iscat-files"}
     plain = json.loads((folder / "benchmark.json").read_text(encoding="utf-8"))
     assert plain["mass"]["x_nm"]["crb"] == pytest.approx(study["mass"]["x_nm"]["crb"])
-    drawn = {path.stem for path in (folder / "figures").iterdir()}
-    assert {"photons_joint", "heights_mass", "pulls_joint"} <= drawn
+    drawn = set(figures_in(folder / "benchmark.html"))
+    assert {"photons-joint", "heights-mass", "pulls-joint"} <= drawn
     page = (folder / "benchmark.html").read_text(encoding="utf-8")
     assert "spread / CRB" in page
     low, high = (f"{100 * end:.1f}" for end in plain["joint"]["z_nm"]["coverage68_ci95"])
@@ -258,11 +259,11 @@ def test_study_is_written_whole(study: dict[str, object], tmp_path) -> None:
 def test_page_shows_how_sure_each_spread_is(study: dict[str, dict[str, object]]) -> None:
     """The bars of the figure end where the intervals do."""
     ends = np.array(study["curves"]["z"]["joint"]["z_nm"]["spread_ci95"])  # type: ignore[index]
-    panel = dict(benchmark_figures(study))["heights_joint"].axes[2]
-    (bars,) = (c for c in panel.collections if isinstance(c, LineCollection))
-    drawn = np.array([segment[:, 1] for segment in bars.get_segments()])
-    np.testing.assert_allclose(drawn, ends, rtol=1e-12)
-    assert 'id="joint-heights"' in render_benchmark(study)
+    (chart,) = (one for one in mode_charts(study, "joint") if one.id == "heights-joint")
+    rows = pd.DataFrame(chart.figure.data["rows"])
+    drawn = rows[(rows["panel"] == "z [nm]") & (rows["kind"] == "point")]
+    np.testing.assert_allclose(drawn[["low", "high"]], ends, rtol=1e-5)
+    assert 'id="heights-joint-figure"' in render_benchmark(study)
 
 
 @pytest.mark.usefixtures("sketched")

@@ -5,18 +5,14 @@ from __future__ import annotations
 import io
 import json
 import tomllib
-import warnings
-import xml.etree.ElementTree as ET
 
 import pandas as pd
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from iscat_analysis.report.style import new_figure, publish
 from iscat_analysis.text import (
     from_table,
-    in_figure,
     in_json,
     in_page,
     in_table,
@@ -42,35 +38,6 @@ EVERY = st.text(st.characters(exclude_categories=()), max_size=12)
 )
 def test_what_a_terminal_would_act_on_is_written_as_an_escape(text: str, shown: str) -> None:
     assert in_terminal(text) == in_page(text) == shown
-
-
-@settings(deadline=None, max_examples=25, derandomize=True)
-@given(EVERY)
-@example("a$\\frac$")
-@example("$x$ \\$ \\\\$")
-@example("_hidden")
-@example("\x1b]0;a\x07\udcff\ufffe")
-def test_a_figure_shows_any_text(text: str) -> None:
-    """Matplotlib parses no formula, its legend leaves none out, and its SVG is XML."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of letters that the font lacks
-        figure = new_figure(2, 2)
-        axes = figure.add_subplot()
-        axes.plot([0, 1], label=in_figure(text))
-        legend = axes.legend()
-        assert len(legend.get_texts()) == (text != "")
-        svg = publish([("a", figure)])["a"]
-    root = ET.fromstring(str(svg).replace("<svg ", '<svg xmlns:xlink="links" ', 1))
-    if text.strip() and text.isascii() and text.isprintable():
-        assert text.strip() in ["".join(node.itertext()).strip() for node in root.iter()]
-
-
-def test_a_formula_that_is_no_text_would_have_failed() -> None:
-    """The control of the test above."""
-    figure = new_figure(2, 2)
-    figure.add_subplot().set_title("a$\\frac$")
-    with pytest.raises(ValueError, match="frac"):
-        publish([("a", figure)])
 
 
 @settings(deadline=None, derandomize=True)

@@ -11,6 +11,7 @@ import pytest
 from event_tables import draw_table
 
 import iscat_analysis as ia
+from iscat_analysis.report.vega import figures_in
 from iscat_analysis.species import Efficiency
 from iscat_analysis.species.comparison import COMPARISON_COLUMNS
 
@@ -82,7 +83,10 @@ def test_many_are_compared_as_each_would_be(first: pd.DataFrame, tmp_path: Path)
     assert [row["source"] for row in written["comparisons"]] == ["table 2", "table 3", "table 4"]
     rows = pd.read_csv(tmp_path / "out" / "comparison.csv")
     assert len(rows) == 6
-    assert (tmp_path / "out" / "figures" / "comparison.png").stat().st_size > 10_000
+    drawn = figures_in(tmp_path / "out" / "comparison.html")
+    assert drawn["shifts"].data["rows"]["name"] == [f"table {n}" for n in (2, 2, 3, 3, 4, 4)]
+    moved = drawn["shifts"].data["rows"]["x"]
+    np.testing.assert_allclose(moved, rows["shift_kda"], rtol=1e-5)
 
 
 def test_notes_tell_of_chance_and_of_the_scale(first: pd.DataFrame) -> None:

@@ -18,6 +18,7 @@ from scipy.stats import exponnorm, norm
 import iscat_analysis as ia
 from iscat_analysis._kernels.mixture import mixture_score
 from iscat_analysis.day.table import read_table
+from iscat_analysis.report.vega import figures_in
 from iscat_analysis.species import Efficiency
 from iscat_analysis.species.equilibrium import (
     COMPOSITION,
@@ -293,11 +294,13 @@ def test_samples_are_read_and_results_written(dimers, free, tmp_path: Path) -> N
     found = ia.fit_kd(tmp_path / "samples.csv", model="dimer", masses_kda=[66.0], out=out)
     assert found.fit.kd_nm == pytest.approx(free.fit.kd_nm, rel=1e-6)
     assert sorted(path.name for path in out.iterdir()) == [
-        ".iscat-files", "figures", "kd.csv", "kd.json",
+        ".iscat-files", "kd.csv", "kd.html", "kd.json",
     ]  # fmt: skip
     assert json.loads((out / "kd.json").read_text())["kd_nm"] == pytest.approx(found.fit.kd_nm)
     assert list(pd.read_csv(out / "kd.csv")["replicate"]) == [1] * 4
-    assert (out / "figures" / "kd.png").stat().st_size > 10_000
+    shown = pd.DataFrame(figures_in(out / "kd.html")["kd"].data["rows"])
+    points = shown[shown["kind"] == "point"]
+    np.testing.assert_allclose(points["y"], found.samples["complexes"], rtol=1e-5)
 
 
 def test_samples_are_read_as_the_table_of_a_day_is(dimers, tmp_path: Path) -> None:

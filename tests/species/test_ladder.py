@@ -12,6 +12,7 @@ from event_tables import draw_table
 from scipy.optimize import approx_fprime
 
 import iscat_analysis as ia
+from iscat_analysis.report.vega import figures_in
 from iscat_analysis.species import Efficiency, Given, Ladder, Number, describe
 from iscat_analysis.species.choices import Chosen
 from iscat_analysis.species.events import Events
@@ -259,7 +260,7 @@ def test_results_are_written(tmp_path: Path, oligomers: pd.DataFrame) -> None:
     notes: list[str] = []
     found = ia.find_species(oligomers, ladder=66.0, draws=2, out=out, notify=notes.append)
     assert sorted(path.name for path in out.iterdir()) == [
-        ".iscat-files", "figures", "species.csv", "species.json",
+        ".iscat-files", "species.csv", "species.html", "species.json",
     ]  # fmt: skip
     written = json.loads((out / "species.json").read_text())
     assert written["ladder"]["steps"] == [1, 2, 4]
@@ -268,6 +269,7 @@ def test_results_are_written(tmp_path: Path, oligomers: pd.DataFrame) -> None:
     assert table["mass_kda"].tolist() == pytest.approx(
         found.species["mass_kda"].tolist(), nan_ok=True
     )
-    assert (out / "figures" / "species.png").stat().st_size > 10_000
+    drawn = pd.DataFrame(figures_in(out / "species.html")["species"].data["rows"])
+    assert drawn[drawn["kind"] == "bar"]["y"].sum() == found.histogram["count"].sum()
     with pytest.raises(ia.DataError, match="earlier result"):
         ia.find_species(oligomers, ladder=66.0, draws=0, out=out)
