@@ -21,7 +21,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from iscat_analysis.config import SCHEMES
 from iscat_analysis.errors import ConfigError, DataError
@@ -48,6 +48,12 @@ from iscat_analysis.report.answer import (
     precision_of,
     species_of,
     track_quantity,
+)
+from iscat_analysis.report.movie_figures import (
+    CREDIBLE_LEVELS,
+    bin_width,
+    credible_shades,
+    trace_data,
 )
 from iscat_analysis.report.numbers import UNITS, number, parameter
 from iscat_analysis.report.pictures import display_range, residual_limit
@@ -77,9 +83,6 @@ SKY = "#56B4E9"
 
 DIVERGING = LinearSegmentedColormap.from_list("residual", ["#00528C", "#FAFAF8", "#BE4600"])
 """Colours of residuals."""
-
-CREDIBLE_LEVELS = (0.95, 0.75, 0.5, 0.25)
-"""Shades of a posterior's joint densities: the share of the probability inside each."""
 
 EVENT_FIGURES = 12
 """Events whose images are written, at most."""
@@ -211,7 +214,8 @@ def plot_masses(
     if not known.any():
         raise DataError(f"{_movie(analysis)}: no event was found, so there are no masses to draw")
     if bins is None:
-        bins = histogram_bins(float(np.ptp(values[known])), sigma[good & np.isfinite(sigma)])
+        wide, ends = bin_width(values[known], sigma[known & good]), values[known]
+        bins = np.arange(np.floor(ends.min() / wide) * wide, ends.max() + wide, wide)
     edges: Any = np.histogram_bin_edges(values[known], bins=bins)
     leaves = np.asarray((rows["mass_kda"] < 0) & ("landing" in analysis.summary), dtype=bool)
     parts = {
@@ -250,12 +254,6 @@ def _quantity(analysis: Analysis) -> Quantity:
         column = "optical_diameter_nm"
         return Quantity(column, "optical diameter", "nm") if column in analysis.tracks else DIAMETER
     return track_quantity(analysis)
-
-
-def histogram_bins(extent: float, spread: FloatArray) -> int:
-    """Count bins of two standard deviations, which do not blur neighbouring species."""
-    width = 2 * float(np.median(spread)) if spread.size else 0.0
-    return int(np.clip(extent / width, 10, 90)) if width > 0 else 10
 
 
 def _species_curve(
@@ -471,48 +469,23 @@ def plot_event(view: EventView, scheme: str, pixel_size_nm: float, *, ax: Any = 
         scale.ax.locator_params(nbins=4)
     scale_bar(panels[0], columns, rows, pixel_size_nm)
     if view.trace is not None and panels.size == 4:
-        draw_trace(panels[3], view.trace)
+        _draw_trace(panels[3], view.trace)
     return panels
 
 
-def draw_trace(axes: Axes, trace: Trace) -> None:
+def _draw_trace(axes: Axes, trace: Trace) -> None:
     """Draw the contrast of every frame, means of some, and the fitted step."""
-    low, high = trace_range(trace)
-    frames = trace.first + np.arange(len(trace.contrast))
-    centres, means = trace_means(trace)
-    half, (begin, end) = max(trace.half_width, 0.5), trace.used
+    told = trace_data(trace)
+    frames, means, step = (
+        np.array([floats(told[name]["frame"]), floats(told[name]["contrast"])])
+        for name in ("frames", "means", "step")
+    )
+    half = max(trace.half_width, 0.5)
     axes.axvspan(trace.frame - half, trace.frame + half, color=BLUE, alpha=0.18, lw=0)
-    axes.plot(frames + 0.5, 1e3 * trace.contrast, color=GREY, lw=0.6, alpha=0.6)
-    axes.plot(centres, 1e3 * means, ".", color=INK, ms=3.5)
-    levels = 1e3 * np.array([trace.before, trace.before, trace.after, trace.after])
-    axes.plot([begin, trace.frame, trace.frame, end], levels, color=VERMILLION, lw=1.6)
-    axes.set(xlim=(frames[0], frames[-1] + 1), ylim=(1e3 * low, 1e3 * high))
-    axes.set(xlabel="frame", ylabel="contrast [10⁻³]")
-
-
-def trace_range(trace: Trace) -> tuple[float, float]:
-    """Give the scale: both levels and nearly all frames, and always a proper interval."""
-    known = trace.contrast[np.isfinite(trace.contrast)]
-    ends = np.quantile(known, [0.005, 0.995]).tolist() if known.size else [0.0]
-    low, high = (pick(*ends, trace.before, trace.after) for pick in (min, max))
-    margin = 0.04 * (high - low) or 1e-6
-    return low - margin, high + margin
-
-
-def trace_means(trace: Trace) -> tuple[FloatArray, FloatArray]:
-    """Average frames, none across the step; where they lie [frames], and their means."""
-    length = trace_length(trace)
-    start = (trace.frame - trace.first) % length
-    number = (len(trace.contrast) - start) // length
-    parts = trace.contrast[start : start + number * length].reshape(number, length)
-    some = np.flatnonzero(np.isfinite(parts).any(axis=1))
-    centres = trace.first + start + (some + 0.5) * length
-    return np.asarray(centres), np.asarray(np.nanmean(parts[some], axis=1))
-
-
-def trace_length(trace: Trace) -> int:
-    """Frames of a mean, of which there are about 40."""
-    return max(1, round(len(trace.contrast) / 40))
+    axes.plot(frames[0] + 0.5, frames[1], color=GREY, lw=0.6, alpha=0.6)
+    axes.plot(*means, ".", color=INK, ms=3.5)
+    axes.plot(*step, color=VERMILLION, lw=1.6)
+    axes.set(xlabel="frame", ylabel="contrast [10⁻³]", xlim=(frames[0, 0], frames[0, -1] + 1))
 
 
 @_styled
@@ -555,17 +528,6 @@ def plot_corner(posterior: PosteriorResult, event: int) -> Panels:
         axes.ticklabel_format(useOffset=False)
     figure.suptitle(f"Posterior of event {event}", x=0.14, ha="left", fontsize=10)
     return _made(grid.ravel())
-
-
-def credible_shades(counts: FloatArray) -> NDArray[np.int64]:
-    """Tell for each cell of a histogram which of the `CREDIBLE_LEVELS` contain it."""
-    flat = counts.ravel()
-    order = np.argsort(-flat, kind="stable")
-    ranked = flat[order]
-    shares = (np.cumsum(ranked) - ranked) / max(float(flat.sum()), 1.0)
-    shades = np.zeros(flat.size, dtype=np.int64)
-    shades[order] = np.less.outer(shares, CREDIBLE_LEVELS).sum(axis=1) * (ranked > 0)
-    return shades.reshape(counts.shape)
 
 
 # ---- Equilibria ----------------------------------------------------------------------------------
