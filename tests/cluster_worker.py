@@ -5,10 +5,6 @@ from __future__ import annotations
 import os
 import time
 from importlib import import_module
-from typing import Any
-
-import pytest
-from sketches import sketch_figures
 
 from iscat_analysis.threads import threads
 
@@ -16,12 +12,6 @@ from iscat_analysis.threads import threads
 def serve(kind: str, options: list[str]) -> None:
     """Be a ``scheduler`` or a ``worker``."""
     import_module(f"distributed.cli.dask_{kind}").main(options)
-
-
-def dask_setup(worker: Any) -> None:
-    """Prepare a worker."""
-    del worker
-    sketch_figures(pytest.MonkeyPatch())
 
 
 def busy(seconds: float, *, progress: object = None) -> tuple[int, int, float, float]:

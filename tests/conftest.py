@@ -6,7 +6,7 @@ import gc
 import math
 import os
 import signal
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 import pytest
@@ -101,24 +101,6 @@ def repetitions(share: float) -> Callable[[int, int], int]:
         return max(few, round(share * all_of_them))
 
     return count
-
-
-@pytest.fixture
-def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave the figures out of reports, of which a test judges something else."""
-    from sketches import sketch_figures
-
-    sketch_figures(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def all_sketched() -> Iterator[None]:
-    """Leave the figures out of the reports of a whole module."""
-    from sketches import sketch_figures
-
-    with pytest.MonkeyPatch.context() as patch:
-        sketch_figures(patch)
-        yield
 
 
 @pytest.fixture(scope="session")

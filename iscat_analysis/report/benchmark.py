@@ -285,7 +285,7 @@ def render_challenge(document: Mapping[str, Any]) -> str:
     """Make the page of scored results."""
     table_1 = document.get("table_1")
     sections = [
-        _ranking_section(document, document["parts"]),
+        ranking_section(document, document["parts"]),
         *(_part_section(name, part) for name, part in document["parts"].items()),
         *([_table_1(table_1)] if table_1 else []),
         _made(document),
@@ -322,7 +322,7 @@ def contest_sections(study: Mapping[str, Any]) -> list[Section]:
         charts.append(_recall_chart(study["detection"]))
     where = f"Where each leaves the bound, mode {curve['mode']}"
     sections = [
-        _ranking_section(study, parts),
+        ranking_section(study, parts),
         *(
             _part_section(f"estimators-{mode}", part, f"Estimators, mode {mode}")
             for mode, part in parts.items()
@@ -368,7 +368,7 @@ def _map_section(found: Mapping[str, Any]) -> Section:
     )
 
 
-def _ranking_section(document: Mapping[str, Any], parts: Mapping[str, Any]) -> Section:
+def ranking_section(document: Mapping[str, Any], parts: Mapping[str, Any]) -> Section:
     """Rank the estimators; those that know more than the counts, or do not look, come last."""
     remarks: dict[str, str] = {}
     for part in parts.values():

@@ -14,8 +14,6 @@ from iscat_analysis.schemas import schema
 from iscat_cli import main
 from iscat_cli.study import benchmark_table
 
-pytestmark = pytest.mark.usefixtures("sketched")
-
 SMALL = ["--set", "fit.roi_nm=900", "--set", "fit.z_range_nm=[0,300]", "--no-posterior"]
 
 

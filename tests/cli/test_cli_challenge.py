@@ -13,8 +13,6 @@ import pytest
 from iscat_analysis.schemas import schema
 from iscat_cli import main
 
-pytestmark = pytest.mark.usefixtures("sketched")
-
 SMALL = ["--set", "fit.roi_nm=900", "--set", "fit.z_range_nm=[0,300]", "--set", "bounds.pixels=11"]
 
 

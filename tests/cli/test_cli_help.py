@@ -18,7 +18,6 @@ import typer
 from event_tables import draw_series
 from report_factory import make_analysis
 from scenes import write_bright_landings
-from sketches import sketch_figures
 from small_movies import SMALL
 from walkers import SETUP, fits_of, walk
 
@@ -112,7 +111,6 @@ def test_every_example_runs(
     for source in laboratory.iterdir():
         (shutil.copytree if source.is_dir() else shutil.copy)(source, tmp_path / source.name)
     monkeypatch.chdir(tmp_path)
-    sketch_figures(monkeypatch)
     program, *arguments = shlex.split(example)
     redirected: Path | None = None
     if ">" in arguments:

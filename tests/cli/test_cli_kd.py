@@ -16,8 +16,6 @@ from iscat_analysis.movie import path_beside
 from iscat_analysis.schemas import schema
 from iscat_cli import main
 
-pytestmark = pytest.mark.usefixtures("all_sketched")
-
 
 @pytest.fixture
 def samples(tmp_path: Path) -> Path:

@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from scenes import OPTICS_TRUTH, write_bright_landings
-from sketches import sketch_figures
 
 from iscat_cli import main, main_fit
 
@@ -44,10 +43,7 @@ def test_what_was_learned_is_not_learned_again(movie: Path, tmp_path: Path) -> N
         assert abs(values[name]["value"] - true) < 4 * values[name]["sigma"]
 
 
-def test_a_measured_template_serves_a_fit(
-    movie: Path, tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sketch_figures(monkeypatch)
+def test_a_measured_template_serves_a_fit(movie: Path, tmp_path: Path, capsys: Captured) -> None:
     out, setup = tmp_path / "picture", str(movie.with_name("setup.toml"))
     given = ["calibrate", "optics", str(movie), "--config", setup, "--measured"]
     assert main([*given, "--free", "focus", "--out", str(out)]) == 2

@@ -15,8 +15,6 @@ from iscat_analysis.schemas import schema
 from iscat_analysis.species import Efficiency
 from iscat_cli import main
 
-pytestmark = pytest.mark.usefixtures("all_sketched")
-
 EFFICIENCY = Efficiency(5.0, 13.0)
 
 

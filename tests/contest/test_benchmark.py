@@ -10,13 +10,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from microscopes import configuration, setting
-from sketches import sketch_figures
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.posterior import van_trees
 from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.report import BENCHMARK_NAMES, render_benchmark
-from iscat_analysis.report.benchmark import mode_charts
+from iscat_analysis.report.benchmark import mode_charts, ranking_section
 from iscat_analysis.report.vega import figures_in
 from iscat_analysis.study import (
     make_setting,
@@ -237,9 +236,7 @@ def _text(value: object) -> str:
 
 def test_study_is_written_whole(study: dict[str, object], tmp_path) -> None:
     folder = tmp_path / "out"
-    with pytest.MonkeyPatch.context() as patch:
-        sketch_figures(patch)
-        write_benchmark(study, folder)
+    write_benchmark(study, folder)
     (folder / "benchmark.json").write_text("{}")
     with pytest.raises(DataError, match="overwrite"):
         write_benchmark(study, folder)
@@ -255,7 +252,6 @@ def test_study_is_written_whole(study: dict[str, object], tmp_path) -> None:
     assert f"[{low}, {high}]" in page
 
 
-@pytest.mark.usefixtures("sketched")
 def test_page_shows_how_sure_each_spread_is(study: dict[str, dict[str, object]]) -> None:
     """The bars of the figure end where the intervals do."""
     ends = np.array(study["curves"]["z"]["joint"]["z_nm"]["spread_ci95"])  # type: ignore[index]
@@ -266,7 +262,6 @@ def test_page_shows_how_sure_each_spread_is(study: dict[str, dict[str, object]])
     assert 'id="heights-joint-figure"' in render_benchmark(study)
 
 
-@pytest.mark.usefixtures("sketched")
 def test_page_of_a_study_without_usable_fits(study: dict[str, dict[str, object]]) -> None:
     kept = study["joint"]["z_nm"]
     nothing = vars(score(np.zeros(0), np.zeros(0), kept["crb"], kept["qcrb"]))
@@ -276,6 +271,18 @@ def test_page_of_a_study_without_usable_fits(study: dict[str, dict[str, object]]
     page = render_benchmark({**study, "joint": lost})
     assert "— ±" not in page
     assert "[—" not in page
+
+
+def test_who_does_not_follow_the_particle_stands_below_all_that_are_ranked() -> None:
+    verdict = "does not follow the particle: its mean hardly moves with the truth"
+    parts = {"joint": {"estimators": {"constant": {"x_nm": {"verdict": verdict}}, "late": {}}}}
+    ranking = [
+        {"estimator": "constant", "kept": 0.01, "below_bound": False},
+        {"estimator": "late", "kept": 0.0, "below_bound": False},
+    ]
+    (table,) = ranking_section({"ranking": ranking}, parts).tables
+    assert [row[:2] for row in table.rows] == [[1, "late"], ["—", "constant"]]
+    assert verdict in table.rows[1][-1]
 
 
 def test_too_few_trials_are_refused() -> None:

@@ -33,8 +33,6 @@ from iscat_cli import main
 from iscat_cli.console import print_result
 from iscat_cli.day import _lines as printed_lines
 
-pytestmark = pytest.mark.usefixtures("all_sketched")
-
 LINE = SETUP["calibration.gradient_per_kda"]
 NAMES = ("a", "b", "c")
 

@@ -21,8 +21,6 @@ from iscat_analysis.day.table import Table, make_plan, read_table
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.movie import open_stack
 
-pytestmark = pytest.mark.usefixtures("all_sketched")
-
 COUNTS = np.arange(7 * 6 * 5, dtype="u2").reshape(7, 6, 5)
 
 

@@ -12,7 +12,7 @@ import iscat_analysis as ia
 from iscat_analysis.config import read_toml
 from iscat_analysis.instrument.learning import REJECTED_P
 
-pytestmark = [pytest.mark.large, pytest.mark.usefixtures("sketched")]
+pytestmark = pytest.mark.large
 
 TRUE_NM = -450.0
 APART_PX = 44

@@ -24,8 +24,6 @@ from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.study import Movie
 
-pytestmark = pytest.mark.usefixtures("all_sketched")
-
 FRAMES, STEP = 240, 60
 
 SWMR = """

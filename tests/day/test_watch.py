@@ -26,8 +26,6 @@ from iscat_analysis.day.watch import MOST_CHECKS, Ready, WatchedFolder
 from iscat_analysis.errors import ConfigError, DataError, SchedulerError
 from iscat_cli import main
 
-pytestmark = pytest.mark.usefixtures("all_sketched")
-
 COUNTS = np.arange(4 * 6 * 6, dtype="u2").reshape(4, 6, 6)
 SET = np.arange(7 * 6 * 5, dtype="u2").reshape(7, 6, 5)
 INTERVAL_S = 0.01

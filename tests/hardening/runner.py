@@ -4,9 +4,7 @@ The order is ``{"run": [argument, …]}``, with
 
 - ``"die": [word, number]`` to end by SIGKILL ``before`` or ``after`` its so manieth renaming
   or replacing of a file;
-- ``"memory_share": share`` to cut a landing movie into many chunks;
-- ``"figures": true`` to draw the figures, which take nine tenths of a small run; otherwise files of
-  a kilobyte take their places.
+- ``"memory_share": share`` to cut a landing movie into many chunks.
 
 It sends word when the run begins.
 """
@@ -20,9 +18,6 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-import pytest
-from sketches import sketch_figures
-
 from iscat_analysis.report.output import claim_output
 from iscat_analysis.search import chunks
 from iscat_cli import main
@@ -30,9 +25,6 @@ from iscat_cli import main
 
 def obey(order: dict[str, Any], ready: Connection) -> int:
     """Do what is ordered, and give the status."""
-    if not order.get("figures"):
-        # a moment to be killed in, at each figure
-        sketch_figures(pytest.MonkeyPatch(), pause_s=0.01)
     if "memory_share" in order:
         chunks.MEMORY_SHARE = order["memory_share"]
     if "die" in order:

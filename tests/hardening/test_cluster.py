@@ -30,10 +30,7 @@ from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.search import chunks as planning
 from iscat_cli import main_fit
 
-pytestmark = [
-    pytest.mark.usefixtures("all_sketched"),
-    pytest.mark.skipif(os.name == "nt", reason="stops processes by signals"),
-]
+pytestmark = [pytest.mark.skipif(os.name == "nt", reason="stops processes by signals")]
 
 DEADLINE_S = 120.0
 

@@ -107,7 +107,6 @@ def test_masses_that_are_asked_for_are_bounded(value: float) -> None:
         ia.fit_kd(samples, tables=[events(), events()], model="dimer")
 
 
-@pytest.mark.usefixtures("sketched")
 def test_the_command_answers_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for number, (mass, sigma) in enumerate(itertools.product((1e300, NONE, 66.0), (1e150, 8.0))):
         path = tmp_path / f"{number}.csv"

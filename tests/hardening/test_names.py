@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from sketches import sketch_figures
 from small_movies import SETUP, analysed, put_in_place_of_fits
 
 import iscat_analysis as ia
@@ -28,9 +27,7 @@ WRITTEN = [name.encode("utf-8", "backslashreplace").decode() for name in NAMES]
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
     """Make a movie and its result."""
-    with pytest.MonkeyPatch.context() as patch:
-        sketch_figures(patch)
-        return analysed(tmp_path_factory.mktemp("made"))
+    return analysed(tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture
@@ -79,7 +76,6 @@ def test_messages_reach_a_terminal_as_text(tmp_path: Path, capsys) -> None:
     assert not {"\x1b", "\x07", "\u202e"} & set(said)
 
 
-@pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize("share", [0.0, 0.7])
 def test_damaged_results_cost_only_themselves(lab: Path, share: float) -> None:
     damaged = {"NA": "fits.parquet", "=1+1": "summary.json", "@a": "config.toml"}
@@ -102,7 +98,6 @@ def test_damaged_results_cost_only_themselves(lab: Path, share: float) -> None:
     assert ia.batch(lab, out=out, config=SETUP).analysed == ()
 
 
-@pytest.mark.usefixtures("sketched")
 def test_watching_goes_on_beside_a_name_that_is_no_text(lab: Path) -> None:
     for path in lab.iterdir():
         if path.stem not in ("plain", NAMES[-2]):

@@ -26,7 +26,6 @@ import pytest
 from forks import fork, send
 from hardening.runner import hold, obey
 from report_factory import make_analysis
-from sketches import sketch_figures
 from small_movies import LANDING
 
 from iscat_analysis.config import load_config
@@ -105,8 +104,6 @@ class Runner:
             contextlib.redirect_stdout(io.StringIO()),
             contextlib.redirect_stderr(said),
         ):
-            if not order.get("figures"):
-                sketch_figures(patch)
             if "memory_share" in order:
                 patch.setattr(chunks, "MEMORY_SHARE", order["memory_share"])
             status = main(order["run"])
@@ -215,7 +212,7 @@ def contents(result: Path) -> dict[str, bytes]:
 
 def test_repeats_are_identical(runner: Runner, place: Path) -> None:
     """In a process that has done other things before, and in one of its own."""
-    order = {"run": [*FIT, "--figures"], "cwd": str(place), "figures": True}
+    order = {"run": [*FIT, "--figures"], "cwd": str(place)}
     found = []
     for run in (runner.here, lambda order: runner.run(order)[0]):
         assert run(order)["status"] == 0
@@ -540,7 +537,6 @@ def test_neighbours_with_similar_names_are_left_alone(tmp_path: Path) -> None:
 # ---- read back -----------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize("mode", ["localize", "track"])
 def test_tables_read_back_by_their_own_libraries(tmp_path: Path, mode: str) -> None:
     out = write_report(make_analysis(7, mode), tmp_path / "out")

@@ -147,7 +147,6 @@ def test_nothing_found_has_only_a_field(tmp_path: Path) -> None:
     assert [path.name for path in written] == ["field.svg"]
 
 
-@pytest.mark.usefixtures("sketched")
 def test_a_report_has_figures_only_where_they_are_wanted(tmp_path: Path) -> None:
     analysis = make_analysis(3)
     plain = write_report(analysis, tmp_path / "plain")

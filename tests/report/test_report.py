@@ -134,7 +134,6 @@ class TestPosterior:
         assert data.posterior["z_nm"].attrs["units"] == "nm"
         data.close()
 
-    @pytest.mark.usefixtures("sketched")
     def test_a_refused_chain_shows_its_message_and_no_number(self, tmp_path: Path) -> None:
         out = write_report(make_analysis(3, "joint", refused=1), tmp_path / "out")
         assert not (out / "posterior.nc").exists()
@@ -143,7 +142,6 @@ class TestPosterior:
         assert "fit ± σ" not in page  # the table of posteriors
 
 
-@pytest.mark.usefixtures("sketched")
 class TestOverwrite:
     def test_an_earlier_result_stays_without_permission(self, tmp_path: Path) -> None:
         out = write_report(without_events(make_analysis(1)), tmp_path / "out")
@@ -178,12 +176,7 @@ class TestOverwrite:
 
 @pytest.mark.parametrize("mode", ["mass", "localize", "joint", "track"])
 @pytest.mark.parametrize("scheme", ["iscat", "darkfield"])
-def test_every_mode_and_scheme_makes_a_page(
-    mode: str, scheme: str, request: pytest.FixtureRequest
-) -> None:
-    """Of a scheme figures have the unit and the greys, which those of mode mass show."""
-    if scheme == "darkfield" and mode != "mass":
-        request.getfixturevalue("sketched")
+def test_every_mode_and_scheme_makes_a_page(mode: str, scheme: str) -> None:
     analysis = make_analysis(60, mode, scheme=scheme, side=16)
     page = render_report(analysis)
     assert f"mode {mode}" in page
@@ -235,7 +228,6 @@ def with_flagged(analysis: Analysis, flagged: int) -> Analysis:
     return replace(analysis, table=table)
 
 
-@pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize(("flagged", "silent"), [(0, False), (8, False), (9, True), (40, True)])
 def test_no_headline_when_more_than_a_fifth_is_flagged(flagged: int, silent: bool) -> None:
     analysis = with_flagged(make_analysis(40), flagged)
@@ -252,7 +244,6 @@ def test_no_headline_when_more_than_a_fifth_is_flagged(flagged: int, silent: boo
     assert headline(alone, event_table(alone))[0].startswith("The only event is flagged. The")
 
 
-@pytest.mark.usefixtures("sketched")
 def test_species_are_shown_for_fair_samples_only() -> None:
     table = make_analysis(40).table
     found = describe(
@@ -267,7 +258,6 @@ def test_species_are_shown_for_fair_samples_only() -> None:
 
 
 @pytest.mark.parametrize("scale", ["calibration", "absolute model"])
-@pytest.mark.usefixtures("sketched")
 def test_several_species_are_one_answer_everywhere_and_have_no_median(
     tmp_path: Path, scale: str
 ) -> None:
@@ -327,7 +317,6 @@ def test_side_lobes_are_no_events() -> None:
     assert tally(sides) == (10, {"ok": 10}, {"sidelobe": 30})
 
 
-@pytest.mark.usefixtures("sketched")
 def test_without_calibration_the_headline_is_a_contrast() -> None:
     analysis = make_analysis(40)
     bare = replace(analysis, summary={**analysis.summary, "mass_scale": "absolute model"})
@@ -343,7 +332,6 @@ def test_without_calibration_the_headline_is_a_contrast() -> None:
     assert "iscat calibrate mass" in page
 
 
-@pytest.mark.usefixtures("sketched")
 def test_optional_columns_stand_beside_sigma() -> None:
     analysis = make_analysis(40)
     table = analysis.table.assign(systematic_mass_kda=7.0, repeat_mass_kda=np.nan, track=1)
