@@ -157,9 +157,10 @@ class Finding:
 
     @property
     def brief(self) -> tuple[str, str]:
-        """The sentence to its first stop after a few words; and the remedy, or else the rest."""
+        """The sentence to the first stop after its first number; and the remedy, or the rest."""
         text = self.kind.sentence.format(**self.values)
-        stop = _STOP.search(text, _FEW_LETTERS)
+        number = re.search(r"\d", text)
+        stop = _STOP.search(text, max(_FEW_LETTERS, number.start() if number else 0))
         first, rest = (text[: stop.start()], text[stop.end() :]) if stop else (text, "")
         return capital(first.rstrip(".")), capital(self.remedy or rest)
 
@@ -195,9 +196,9 @@ class Findings:
 
 
 def capital(text: str) -> str:
-    """Begin a text with a capital letter, unless it begins with a key of the configuration."""
+    """Begin a text with a capital letter, unless it begins with a key or a symbol."""
     first = text.split(" ")[0]
-    return text if set('._`"') & set(first) else text[:1].upper() + text[1:]
+    return text if set('._`"σ') & set(first) else text[:1].upper() + text[1:]
 
 
 def unreported(finding: Finding) -> None:

@@ -22,13 +22,7 @@ from scipy.special import chdtrc
 
 from iscat_analysis.config import MODES, SCHEMES
 from iscat_analysis.findings import Finding
-from iscat_analysis.findings.results import (
-    MANY_FLAGGED,
-    MODEL_REJECTED,
-    NO_TRACK,
-    NOT_A_MASS,
-    NOTHING_FOUND,
-)
+from iscat_analysis.findings.results import MANY_FLAGGED, MODEL_REJECTED, NOT_A_MASS, NOTHING_FOUND
 from iscat_analysis.reading import read_json, read_parquet
 from iscat_analysis.records import (
     POOR_P,
@@ -43,7 +37,6 @@ from iscat_analysis.records import (
 )
 from iscat_analysis.report.numbers import (
     LABELS,
-    UNITS,
     Fact,
     Table,
     decimals_for,
@@ -52,7 +45,6 @@ from iscat_analysis.report.numbers import (
     number,
     numeric,
     of,
-    percent,
     sentence,
     tabulate,
     with_error,
@@ -512,90 +504,6 @@ def rejection(table: pd.DataFrame) -> Finding | None:
 def not_a_mass(analysis: Analysis) -> list[str]:
     """Say that masses are on the model's own scale, where they are."""
     return [sentence(NOT_A_MASS().text)] if is_uncalibrated(analysis) else []
-
-
-def headline(analysis: Analysis, table: pd.DataFrame) -> list[str]:
-    """Summarise the result in two or three sentences; `table` has the events, or all positions."""
-    kind, tracks = row_kind(analysis), tracks_of(analysis)
-    found = counted(table)
-    if found.empty:
-        return [sentence(NOTHING_FOUND().text)]
-    positions = count(len(table), "fitted position")
-    if kind is TRACKS_KIND and tracks.empty:
-        return [sentence(NO_TRACK({"positions": positions}).text)]
-    lines = [*spread_lines(analysis, found), *not_a_mass(analysis)]
-    judged = found if kind is EVENTS_KIND else tracks
-    rows, flagged = tally(judged), caution(judged, kind)
-    parts = [] if flagged is not None else [fact.text for fact in answers(analysis, found)]
-    ok = f"{rows.ok if rows.flagged else 'all'} of them ok."
-    if kind is TRACKS_KIND:
-        text = f"{count(rows.number, 'track')} of {positions}, {ok}"
-        if flagged is not None:
-            text += f" {sentence(flagged.text)}"
-        elif parts:
-            text += f" Over tracks: {', '.join(each[:1].lower() + each[1:] for each in parts)}."
-        return [text, *lines]
-    if flagged is not None:
-        return [sentence(flagged.text), *lines]
-    text = " ".join([f"{count(rows.number, 'event')}, {ok}", *(f"{part}." for part in parts)])
-    if rows.number == 1:
-        text = "One event, and it is ok."
-    return [text, *_against_bounds(analysis, found), *lines]
-
-
-def _against_bounds(analysis: Analysis, table: pd.DataFrame) -> list[str]:
-    """Compare σ of the mass, or else of the height, with the bounds."""
-    name, good = main_parameter(analysis), _good(table)
-    p = precision_of(analysis, table, name)
-    if not p.events:
-        return []
-    of_it = LABELS[name]
-    sigma, shared = (f"{number(value)} {UNITS[name]}" for value in (p.sigma, p.systematic))
-    is_shared = math.isfinite(p.systematic)
-    if is_uncalibrated(analysis):
-        of_it, is_shared = "contrast", "systematic_contrast" in good
-        errors = good.get("systematic_contrast", good["contrast"] * math.nan)
-        sigma, shared = (
-            f"{percent(quartiles((error / whole.abs()).to_numpy(float))[1])} of it"
-            for error, whole in (
-                (good["sigma_mass_kda"], good["mass_kda"]),
-                (errors, good["contrast"]),
-            )
-        )
-    text = f"σ of the {of_it}, from the curvature of the likelihood, is {sigma}"
-    text += f", {number(p.over_crb)} times the Cramér–Rao bound"
-    if is_shared:
-        text += f"; the error common to all events is {shared}"
-    if math.isfinite(p.information):
-        of = "can be had of the light" if math.isfinite(p.holevo) else "is in the light"
-        text += f"; {percent(p.information)} of the information that {of} is used"
-    return [f"{text}."]
-
-
-def spread_lines(analysis: Analysis, table: pd.DataFrame) -> list[str]:
-    """Describe the measured spread, and whether the model is rejected."""
-    message = analysis.summary.get("repeats", {}).get("message", "")
-    name, lines = main_parameter(analysis), []
-    p = precision_of(analysis, table, name)
-    if message:
-        lines.append(sentence(message) if message[:1] != "σ" else f"{message}.")
-    elif p.is_measured:
-        where = "between parts of each event's frames; slower noise does not show there"
-        if p.whole:
-            where = (
-                "between parts of each event's frames and, at full length, where there is no "
-                "particle"
-            )
-        if analysis.mode_kind.follows_tracks:
-            where = "of single frames where there is no particle"
-        of_it = "contrast" if is_uncalibrated(analysis) else LABELS[name]
-        lines.append(
-            f"The measured spread of the {of_it}, {where}, is {p.measured_text} times the "
-            "Cramér–Rao bound."
-        )
-    if (rejected := rejection(table)) is not None:
-        lines += [sentence(rejected.text), *species_widths(analysis.summary)]
-    return lines
 
 
 def species_widths(summary: Mapping[str, Any]) -> list[str]:

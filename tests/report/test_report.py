@@ -22,7 +22,7 @@ from iscat_analysis.notebook import Result
 from iscat_analysis.pipeline.stored import open_result
 from iscat_analysis.records import EVENT_COLUMNS, Analysis, Status, counted, tally
 from iscat_analysis.report import check_output, render_page, render_report, write_report
-from iscat_analysis.report.answer import answer_in, answers, headline, precision_of
+from iscat_analysis.report.answer import answer_in, answers, precision_of, spoken
 from iscat_analysis.report.movie_figures import (
     CREDIBLE_LEVELS,
     PICTURE_PX,
@@ -231,7 +231,8 @@ def with_flagged(analysis: Analysis, flagged: int) -> Analysis:
 @pytest.mark.parametrize(("flagged", "silent"), [(0, False), (8, False), (9, True), (40, True)])
 def test_no_headline_when_more_than_a_fifth_is_flagged(flagged: int, silent: bool) -> None:
     analysis = with_flagged(make_analysis(40), flagged)
-    first = headline(analysis, event_table(analysis))[0]
+    said = spoken(analysis)
+    first = " ".join([*said.cautions, *said.facts])
     assert first.startswith(f"{flagged} of 40 events are flagged") == silent
     assert ("the rest is no fair sample" in first) == (silent and flagged < 40)
     assert ("Mass 6" in first) != silent
@@ -239,9 +240,9 @@ def test_no_headline_when_more_than_a_fifth_is_flagged(flagged: int, silent: boo
     assert ("not alike" in page) != silent
     assert ("No answer is given" in page) == silent
     assert (Status.POOR_FIT.advice in first) == silent
-    assert "×10⁹" not in " ".join(headline(analysis, event_table(analysis)))
-    alone = with_flagged(make_analysis(1), 1)
-    assert headline(alone, event_table(alone))[0].startswith("The only event is flagged. The")
+    assert "×10⁹" not in first
+    alone = spoken(with_flagged(make_analysis(1), 1))
+    assert alone.cautions[0].startswith("The only event is flagged. The")
 
 
 def test_species_are_shown_for_fair_samples_only() -> None:
@@ -278,8 +279,7 @@ def test_several_species_are_one_answer_everywhere_and_have_no_median(
     page = (out / "report.html").read_text(encoding="utf-8")
     shown = repr(Result(analysis)), repr(open_result(out))
     assert page.count("<tr data-species") == 3
-    for text in (answer_in(out), headline(analysis, analysis.table)[0]):
-        assert answer in text
+    assert answer in answer_in(out)
     for text in shown:
         assert f"{quantity} ± σ{unit and ' [kDa]'}" in text
         listed = [float(line.split()[0]) for line in text.splitlines()[2:5]]
@@ -307,11 +307,9 @@ def test_few_events_that_are_not_alike_have_no_median(spread: float, said: str) 
 def test_side_lobes_are_no_events() -> None:
     """Thirty of forty rows are side lobes with absurd masses: ten events remain, and all count."""
     analysis = with_flagged(make_analysis(40), 30)
-    table = event_table(analysis).replace({"status": {"poor_fit": "sidelobe"}})
-    assert headline(analysis, table)[0].startswith("10 events, all of them ok. Mass ")
-    assert "×10⁹" not in headline(analysis, table)[0]
     sides = analysis.table.replace({"status": {"poor_fit": "sidelobe"}})
     shown = repr(Result(replace(analysis, table=sides)))
+    assert "×10⁹" not in shown
     assert shown.startswith("Result: 10 events in ")
     assert "10 events: 10 ok; further rows, which are no events: 30 sidelobe." in shown
     assert tally(sides) == (10, {"ok": 10}, {"sidelobe": 30})
@@ -320,11 +318,11 @@ def test_side_lobes_are_no_events() -> None:
 def test_without_calibration_the_headline_is_a_contrast() -> None:
     analysis = make_analysis(40)
     bare = replace(analysis, summary={**analysis.summary, "mass_scale": "absolute model"})
-    assert not any("Not calibrated" in line for line in headline(analysis, event_table(analysis)))
-    said = headline(bare, event_table(bare))
-    assert f"{NOT_A_MASS().text}." in said
-    assert "Contrast 0.00" in said[0]
-    assert "kDa" not in said[0]
+    assert not spoken(analysis).cautions
+    said = spoken(bare)
+    assert said.cautions == [f"{NOT_A_MASS().text}."]
+    assert said.facts[0].startswith("Contrast 0.00")
+    assert "kDa" not in said.facts[0]
     page = render_report(bare)
     assert "kDa" not in re.sub(
         r"<script.*?</script>|<code>.*?</code>|<pre.*?</pre>", "", page, flags=re.S

@@ -18,7 +18,7 @@ from iscat_analysis.findings.results import NOT_A_MASS
 from iscat_analysis.notebook import Result
 from iscat_analysis.records import FREE_PARAMETERS, TRACK_COLUMNS, free_parameters
 from iscat_analysis.report import pictures, render_report, write_report
-from iscat_analysis.report.answer import headline
+from iscat_analysis.report.answer import spoken
 from iscat_analysis.report.movie_figures import mean_squared_displacement, movie_figures
 from iscat_analysis.report.pictures import films_shown
 from iscat_analysis.report.vega import figures_in
@@ -90,19 +90,18 @@ def test_a_headline_of_tracks_that_are_flagged_has_no_median() -> None:
     analysis = make_analysis(200, "track")
     assert analysis.tracks is not None
     tracks = analysis.tracks.assign(status="ok", flags="")
-    said = headline(replace(analysis, tracks=tracks), analysis.table)
-    assert "Over tracks: mass 6" in said[0]
+    assert spoken(replace(analysis, tracks=tracks)).facts[0].startswith("Mass 6")
     tracks.loc[:4, ["status", "flags"]] = "not_free"
-    said = headline(replace(analysis, tracks=tracks), analysis.table)
-    assert "5 of 20 that are long enough are flagged" in said[0]
-    assert "mass 6" not in said[0]
+    said = spoken(replace(analysis, tracks=tracks))
+    assert said.cautions[0].startswith("5 of 20 that are long enough are flagged")
+    assert said.facts == []
     tracks.loc[:4, ["status", "flags"]] = "few_frames"
-    assert "mass 6" in headline(replace(analysis, tracks=tracks), analysis.table)[0]
+    assert spoken(replace(analysis, tracks=tracks)).facts[0].startswith("Mass 6")
     bare = replace(analysis, tracks=tracks, summary={**analysis.summary, "mass_scale": "absolute"})
-    said = headline(bare, analysis.table)
-    assert f"{NOT_A_MASS().text}." in said
-    assert "contrast" in said[0]
-    assert "kDa" not in said[0]
+    said = spoken(bare)
+    assert f"{NOT_A_MASS().text}." in said.cautions
+    assert said.facts[0].startswith("Contrast")
+    assert "kDa" not in said.facts[0]
 
 
 def test_a_height_that_was_held_fixed_is_in_no_table_of_precision() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,8 +34,7 @@ from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline.finish import species_of
 from iscat_analysis.records import FREE_PARAMETERS, Candidate
 from iscat_analysis.report import render_report
-from iscat_analysis.report.answer import headline, rejection, species_widths
-from iscat_analysis.report.tables import event_table
+from iscat_analysis.report.answer import rejection, species_widths
 from iscat_analysis.search.empty import CONTRASTS, EmptyField
 from iscat_analysis.species.tables import event_table as events_of
 from iscat_analysis.trust.checks import likely_noise, measured_scale, spread_verdict
@@ -357,11 +357,14 @@ def test_the_page_shows_what_was_measured() -> None:
 
 
 def test_understated_errors_are_never_shown_without_the_line() -> None:
-    analysis = _measured(1.4, "σ is too small: the measured spread is 1.40")
-    assert any("σ is too small" in line for line in headline(analysis, event_table(analysis)))
+    found = UNDERSTATED_SIGMA({"ratios": "1.40", "cause": "its kind is not told"})
+    analysis = replace(_measured(1.4, found.text), findings=(found,))
     flagged = analysis.table.assign(status="poor_fit", flags="poor_fit")
-    lines = headline(replace(analysis, table=flagged), flagged)
-    assert any("σ is too small" in line for line in lines)
+    for one in (analysis, replace(analysis, table=flagged)):
+        first = re.search(r'<ul class="trust".*?</ul>', render_report(one), re.DOTALL)
+        assert first is not None
+        assert "σ is too small: the measured spread is 1.40 times the Cramér–Rao bound" in first[0]
+        assert "Errors are right" not in first[0]
 
 
 def test_a_rejected_model_is_named_where_the_spread_is() -> None:
@@ -376,9 +379,9 @@ def test_a_rejected_model_is_named_where_the_spread_is() -> None:
     assert 30 <= found.values["poor"] < 40
     analysis = _measured(1.0)
     table = analysis.table.assign(p_value=1e-9)
-    said = headline(replace(analysis, table=table), table)
-    assert any("measured spread" in line for line in said)
-    assert any("model is rejected" in line for line in said)
+    page = render_report(replace(analysis, table=table))
+    assert "The model is rejected" in page
+    assert "the measured spread is 1.00" in page
 
 
 def test_the_model_of_moving_particles_is_rejected_by_most_tracks_and_not_by_two() -> None:
