@@ -1,28 +1,41 @@
 """Run an estimator in a process of its own, which may fail, hang or grow without harm to others.
 
 The parent writes what is asked for into a file, and starts this module; the child adds an answer
-to another file as soon as a job is done.  What is there when the time is up counts.
+to another file as soon as a job is done.  What is there when the time is up counts.  Nothing that
+the child leaves is trusted: its answers and its last words have a size and a form, and all that it
+started ends with it.
 """
 
 from __future__ import annotations
 
-import json
+import os
 import pickle
+import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
-from iscat_analysis.reading import first_line
+from iscat_analysis.reading import first_line, model_of, read_bytes
 from iscat_analysis.records import FloatArray, Progress
 from iscat_analysis.study import EstimatorSetup, Setting, setup_of
-from iscat_contest.estimators import Estimate, Estimator, checked_table
+from iscat_contest.estimators import COLUMNS, Estimate, Estimator, checked_table
+
+GRACE_S = 1.0
+"""Time between asking an estimator's processes to end and killing them."""
+
+_LAST_WORDS = 65_536  # bytes of what a process wrote to its standard error
+_MOST_BYTES = 5_000  # of an answer, for each region and for what is about all of them
+_LONGEST_REASON = 300  # characters
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,14 +76,36 @@ class Answer:
     def line(self) -> str:
         """Write it as one line of JSON."""
         columns = {name: values.tolist() for name, values in self.columns.items()}
-        return json.dumps({**vars(self), "columns": columns})
+        return _Line.model_construct(**{**vars(self), "columns": columns}).model_dump_json()
 
     @classmethod
-    def of_line(cls, line: str) -> Answer:
-        """Read a line."""
-        found = json.loads(line)
-        columns = {name: np.array(values, float) for name, values in found["columns"].items()}
-        return cls(**{**found, "columns": columns})
+    def of_line(cls, line: bytes, count: int) -> Answer:
+        """Read a line about so many regions, or raise ValueError."""
+        found = model_of(_Line, line)
+        columns = {name: np.array(values, float) for name, values in found.columns.items()}
+        named = {name.removeprefix("sigma_") for name in columns} <= {*COLUMNS}
+        if not named or any(values.size != count for values in columns.values()):
+            raise ValueError(f"its columns are not {', '.join(COLUMNS)} of {count} regions")
+        if _answered(columns) + sum(found.failures.values()) != count:
+            raise ValueError(f"it does not account for {count} regions")
+        numbers = np.array([found.seconds, found.processor_seconds, found.peak_mb], float)
+        return cls(columns, found.failures, *numbers.tolist())
+
+
+_Number = Annotated[float, Field(allow_inf_nan=False)] | None
+_Reason = Annotated[str, Field(max_length=_LONGEST_REASON)]
+
+
+class _Line(BaseModel):
+    """What a line of the answers' file holds."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    columns: dict[str, list[_Number]]
+    failures: dict[_Reason, Annotated[int, Field(ge=1)]]
+    seconds: _Number
+    processor_seconds: _Number
+    peak_mb: _Number
 
 
 def run_estimator(
@@ -80,26 +115,60 @@ def run_estimator(
 
     What it did not answer is counted as failed, with the reason.
     """
-    with tempfile.TemporaryDirectory(prefix="estimator-") as name:
-        request, answers, said = (Path(name) / part for part in ("request", "answers", "said"))
+    # What the child left there may refuse to be removed.
+    with tempfile.TemporaryDirectory(prefix="estimator-", ignore_cleanup_errors=True) as name:
+        request, answers = (Path(name) / part for part in ("request", "answers"))
         request.write_bytes(pickle.dumps((estimator, list(jobs), [*paths])))
         answers.touch()
-        command = [sys.executable, "-m", __name__, str(request), str(answers)]
-        with said.open("wb") as stream:
-            try:
-                ended = subprocess.run(
-                    command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stream,
-                    timeout=limit_s, check=False,
-                )  # fmt: skip
-                lines = said.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-                # characters of what a process said last
-                last = f": {lines[-1][-200:]}" if lines else ""
-                why = f"its process ended with status {ended.returncode}{last}"
-            except subprocess.TimeoutExpired:
-                why = f"no answer within {limit_s:g} s"
-        done = _read(answers)
-    missing = [Answer(failures={why: len(job.before)}) for job in jobs[len(done) :]]
+        why = _run([sys.executable, "-m", __name__, str(request), str(answers)], limit_s)
+        done, refused = read_answers(answers, [len(job.before) for job in jobs])
+    missing = [Answer(failures={refused or why: len(job.before)}) for job in jobs[len(done) :]]
     return [*done, *missing]
+
+
+def _run(command: Sequence[str], limit_s: float) -> str:
+    """Run a command within a time, end all that it started, and say how it ended."""
+    reading, writing = os.pipe()
+    last_words = bytearray()
+    reader = threading.Thread(target=_keep_end, args=(reading, last_words), daemon=True)
+    try:
+        child = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=writing,
+            start_new_session=True,
+        )  # fmt: skip
+    finally:
+        os.close(writing)
+        reader.start()
+    try:
+        status = child.wait(limit_s)
+    except subprocess.TimeoutExpired:
+        return f"no answer within {limit_s:g} s"
+    finally:
+        _end(child)
+        reader.join(GRACE_S)  # a process that left the group may hold the pipe for ever
+    lines = bytes(last_words).decode(errors="replace").strip().splitlines()
+    # characters of what a process said last
+    return f"its process ended with status {status}" + (f": {lines[-1][-200:]}" if lines else "")
+
+
+def _keep_end(handle: int, kept: bytearray) -> None:
+    """Read a pipe to its end, and keep the last of it."""
+    with os.fdopen(handle, "rb", buffering=0) as pipe:
+        while chunk := pipe.read(_LAST_WORDS):
+            kept += chunk
+            del kept[:-_LAST_WORDS]
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    """End a process and its group, which are asked first and then killed."""
+    if sys.platform == "win32":
+        child.kill()
+        return
+    for number in (signal.SIGTERM, signal.SIGKILL):
+        with suppress(OSError):
+            os.killpg(child.pid, number)
+        with suppress(subprocess.TimeoutExpired):
+            child.wait(GRACE_S)
 
 
 def run_estimators(
@@ -114,10 +183,21 @@ def run_estimators(
     return answers
 
 
-def _read(path: Path) -> list[Answer]:
-    """Read the answers that are whole, of a process that runs what others wrote."""
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    return [Answer.of_line(line) for line in lines if line.endswith("\n")]
+def read_answers(path: Path, counts: Sequence[int]) -> tuple[list[Answer], str]:
+    """Read answers that are whole, about so many regions each; and say why others are refused."""
+    done: list[Answer] = []
+    try:
+        if path.is_symlink():
+            raise ValueError("their file is a link")
+        lines = read_bytes(path, _MOST_BYTES * (len(counts) + sum(counts))).split(b"\n")[:-1]
+        if len(lines) > len(counts):
+            raise ValueError(f"there are {len(lines)}, and {len(counts)} were asked for")
+        for line, count in zip(lines, counts, strict=False):
+            done.append(Answer.of_line(line, count))
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else None
+        return done, f"its answers are refused: {why or first_line(error)}"
+    return done, ""
 
 
 def answer(estimate: Estimate, job: Job) -> Answer:
@@ -135,11 +215,15 @@ def answer(estimate: Estimate, job: Job) -> Answer:
         amplitude = columns.pop(f"{prefix}amplitude", None)
         if amplitude is not None:
             columns.setdefault(f"{prefix}mass_kda", scale * amplitude)
-    values = [v for name, v in columns.items() if not name.startswith("sigma_")]
-    answered = int(np.isfinite(values).any(axis=0).sum()) if values else 0
-    if unanswered := count - answered - sum(failures.values()):
+    if unanswered := count - _answered(columns) - sum(failures.values()):
         failures["no number"] = unanswered
     return Answer(columns, failures, clock, processor, _peak_mb())
+
+
+def _answered(columns: Mapping[str, FloatArray]) -> int:
+    """Count the regions for which there is a number other than an error."""
+    values = [v for name, v in columns.items() if not name.startswith("sigma_")]
+    return int(np.isfinite(values).any(axis=0).sum()) if values else 0
 
 
 def _one_by_one(estimate: Estimate, job: Job, failures: dict[str, int]) -> dict[str, FloatArray]:
@@ -151,7 +235,8 @@ def _one_by_one(estimate: Estimate, job: Job, failures: dict[str, int]) -> dict[
         try:
             row = checked_table(estimate(before, after, job.setup.of(i, i + 1)), 1)
         except Exception as error:
-            why = f"{type(error).__name__}: {first_line(error)}"
+            text = f"{type(error).__name__}: {first_line(error)}"[:_LONGEST_REASON]
+            why = text.encode(errors="replace").decode()  # JSON has no halves of characters
             failures[why] = failures.get(why, 0) + 1
             continue
         for name, value in row.items():

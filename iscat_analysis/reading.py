@@ -19,11 +19,14 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
+    from pydantic import BaseModel
+
+M = TypeVar("M", bound="BaseModel")
 
 LARGEST_TEXT_BYTES = 10_000_000
 """No configuration, list of samples or summary is longer."""
@@ -108,6 +111,18 @@ def json_of(text: str) -> Any:
         return json.loads(text)
     except RecursionError:
         raise ValueError("its brackets are nested too deep") from None
+
+
+def model_of(model: type[M], text: str | bytes) -> M:
+    """Read JSON of a known form; the error names the first key that is not of it."""
+    from pydantic import ValidationError
+
+    try:
+        return model.model_validate_json(text, strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        key = ".".join(map(str, first["loc"]))
+        raise ValueError(f"{key[:90]}: {first['msg'][:100]}".removeprefix(": ")) from None
 
 
 def toml_of(text: str) -> dict[str, Any]:

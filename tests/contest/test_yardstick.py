@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import time
+import tracemalloc
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import estimators_for_tests
 import numpy as np
@@ -32,7 +37,7 @@ from iscat_contest.estimators import (
     find_estimator,
     known_estimators,
 )
-from iscat_contest.process import answer, run_estimator
+from iscat_contest.process import Answer, answer, read_answers, run_estimator
 
 COUNT = 400
 COUNTED = 12
@@ -231,6 +236,135 @@ def test_a_process_that_hangs_or_dies_is_counted(name, limit_s, said, drawn, rep
     found = run_estimator(one, [drawn.job, drawn.job], limit_s, [str(repo_root / "tests")])
     assert [sum(part.failures.values()) for part in found] == [COUNTED, COUNTED]
     assert said in next(iter(found[0].failures))
+
+
+def _alive(number: int) -> bool:
+    """Tell whether a process is at work; one that ended and was not collected is not."""
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
+@pytest.mark.parametrize("hang", ["", "yes"])
+def test_what_an_estimator_starts_ends_with_it(
+    hang, drawn, repo_root, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twenty forked processes that ignore SIGTERM, of an estimator that answers or hangs."""
+    monkeypatch.setenv("CHILDREN", str(tmp_path / "children"))
+    monkeypatch.setenv("HANG", hang)
+    one = find_estimator("estimators_for_tests:leaves_children")
+    limit_s = 15.0 if hang else 300.0
+    found = run_estimator(one, [drawn.job], limit_s, [str(repo_root / "tests")])
+    children = json.loads((tmp_path / "children").read_text(encoding="utf-8"))
+    assert len(children) == 20
+    deadline = time.monotonic() + 20  # the system may be slow to end what was killed
+    while any(map(_alive, children)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(map(_alive, children))
+    assert sum(found[0].failures.values()) == (COUNTED if hang else 0)
+
+
+def test_a_process_that_leaves_its_group_keeps_nobody_waiting(
+    drawn, repo_root, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It holds the pipe, and is the limit of what SECURITY.md promises."""
+    monkeypatch.setenv("CHILDREN", str(tmp_path / "children"))
+    one = find_estimator("estimators_for_tests:leaves_its_group")
+    begin = time.monotonic()
+    (found,) = run_estimator(one, [drawn.job], 300.0, [str(repo_root / "tests")])
+    assert time.monotonic() - begin < 50
+    assert "ended with status 7" in next(iter(found.failures))
+    for child in json.loads((tmp_path / "children").read_text(encoding="utf-8")):
+        os.kill(child, signal.SIGKILL)
+
+
+def test_what_an_estimator_shouts_is_not_kept(drawn, repo_root) -> None:
+    """Of 300 MB the last line is told, and the rest is in no memory and no file."""
+    one = find_estimator("estimators_for_tests:shouts")
+    tracemalloc.start()
+    (found,) = run_estimator(one, [drawn.job], 300.0, [str(repo_root / "tests")])
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert "ended with status 3: the last line" in next(iter(found.failures))
+    assert most < 10_000_000
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        ("pipe", "it is a pipe or a device"),
+        ("folder", "Is a directory"),
+        ("nothing", "No such file"),
+        ("/etc/passwd", "their file is a link"),
+        ("/dev/zero", "their file is a link"),
+    ],
+)
+def test_answers_are_read_from_a_plain_file(
+    what, said, drawn, repo_root, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ANSWERS", what)
+    one = find_estimator("estimators_for_tests:replaces_its_answers")
+    found = run_estimator(one, [drawn.job] * 2, 300.0, [str(repo_root / "tests")])
+    assert [sum(part.failures.values()) for part in found] == [COUNTED, COUNTED]
+    assert said in next(iter(found[0].failures))
+
+
+_GOOD = Answer({"x_nm": np.array([1.0, np.nan, 3.0, 4.0])}, {"no number": 1}, 0.5).line()
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (_GOOD.replace("[1.0,null,3.0,4.0]", "[1.0]"), "of 4 regions"),
+        (_GOOD.replace("[1.0,null,3.0,4.0]", "1.0"), "columns.x_nm: Input should be a valid array"),
+        (_GOOD.replace("[1.0,null,3.0,4.0]", "[[1.0],2.0,3.0,4.0]"), "columns.x_nm.0: "),
+        (_GOOD.replace("3.0", "NaN"), "columns.x_nm.2: Input should be a finite number"),
+        (_GOOD.replace("3.0", "Infinity"), "columns.x_nm.2: Input should be a finite number"),
+        (_GOOD.replace("3.0", "1e999"), "columns.x_nm.2: Input should be a finite number"),
+        (_GOOD.replace("3.0", "9" * 5000), ""),
+        (_GOOD.replace("3.0", '"3.0"'), "columns.x_nm.2: Input should be a valid number"),
+        (_GOOD.replace("3.0", "true"), "columns.x_nm.2: Input should be a valid number"),
+        (_GOOD.replace("x_nm", "sigma_sigma_x_nm"), "its columns are not"),
+        (_GOOD.replace("x_nm", "__class__"), "its columns are not"),
+        (_GOOD.replace("null", "2.0"), "does not account for 4 regions"),
+        (_GOOD.replace(":1}", ":-1}"), "failures.no number: Input should be greater"),
+        (_GOOD.replace(":1}", ":1.5}"), "failures.no number: Input should be a valid integer"),
+        (_GOOD.replace("no number", "n" * 1000), "at most 300 characters"),
+        (_GOOD.replace("seconds", "second", 1), "seconds: Field required"),
+        (_GOOD.replace("0.5", '"soon"'), "seconds: Input should be a valid number"),
+        (_GOOD.replace('{"columns"', '{"more":1,"columns"'), "more: Extra inputs"),
+        (_GOOD[:-1], "Invalid JSON"),
+        ("[" * 10_000, "Invalid JSON"),
+        ("\0", "Invalid JSON"),
+        ("null", "Input should be an object"),
+        ("x" * 100_000, "bytes long"),
+    ],
+)
+def test_answers_of_another_form_are_refused(line: str, said: str, tmp_path: Path) -> None:
+    """What was answered before them counts, as it does where a process ends too early."""
+    path = tmp_path / "answers"
+    path.write_text(f"{_GOOD}\n{line}\n{_GOOD}\n", encoding="utf-8")
+    done, refused = read_answers(path, [4, 4, 4])
+    assert said in refused
+    assert len(done) == (0 if "bytes long" in said else 1)
+    path.write_bytes(b"\xff\xfe\n")
+    assert "Invalid JSON" in read_answers(path, [4])[1]
+
+
+def test_answers_are_as_many_as_were_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "answers"
+    path.write_text(f"{_GOOD}\n" * 3 + _GOOD, encoding="utf-8")
+    done, refused = read_answers(path, [4, 4, 4])
+    assert not refused
+    np.testing.assert_array_equal(done[2].columns["x_nm"], [1.0, np.nan, 3.0, 4.0])
+    assert (done[2].failures, done[2].seconds) == ({"no number": 1}, 0.5)
+    assert np.isnan(done[2].peak_mb)
+    assert read_answers(path, [4, 4]) == (
+        [],
+        "its answers are refused: there are 3, and 2 were asked for",
+    )
 
 
 def test_one_bad_region_costs_no_other_and_any_amplitude_becomes_a_mass(drawn) -> None:
