@@ -126,10 +126,9 @@ class Search:
         """Experiment with other optics and the same light on the particle."""
         power = (settings["attenuation"] / self.start["attenuation"]) ** 2
         photons = self.config.bounds.photons_per_pixel * power
-        bounds = self.config.bounds.model_copy(update={"photons_per_pixel": photons})
-        optics = with_settings(self.config, settings).optics
-        optics = optics.model_copy(update={"file": None, "covariance": None})
-        return self.config.model_copy(update={"optics": optics, "bounds": bounds})
+        return with_settings(self.config, settings).changed(
+            bounds={"photons_per_pixel": photons}, optics={"file": None, "covariance": None}
+        )
 
     def value(self, settings: Settings) -> tuple[float, Settings]:
         """Compute ln F and the optics, dimmed where the well depth requires it."""
@@ -377,10 +376,8 @@ def _uncalibrated(config: Config, scale: MassScale | None) -> Config:
         return config
     matter = plan(config, scale=scale).model.material
     density = matter.density_kg_m3 * matter.mass_kda / abs(scale.amplitude(matter.mass_kda))
-    particle = config.particle.model_copy(
-        update={"density_kg_m3": density, "mass_kda": matter.mass_kda, "diameter_nm": None}
-    )
-    return config.model_copy(update={"calibration": None, "particle": particle})
+    known = {"density_kg_m3": density, "mass_kda": matter.mass_kda, "diameter_nm": None}
+    return config.changed(calibration=None, particle=known)
 
 
 def _cropped(config: Config) -> Config:
@@ -394,7 +391,7 @@ def _cropped(config: Config) -> Config:
     needed += (needed - at.pixels) % 2
     if needed >= at.pixels:
         return config
-    return config.model_copy(update={"bounds": at.model_copy(update={"pixels": needed})})
+    return config.changed(bounds={"pixels": needed})
 
 
 def _chosen(config: Config, chosen: Sequence[str] | None) -> tuple[str, ...]:

@@ -224,7 +224,7 @@ def with_standards(config: Config) -> Config:
         "height_nm": found.height_nm,
         "optics_assumed": True,
     }
-    return config.model_copy(update={"calibration": line.model_copy(update=update)})
+    return config.changed(calibration=update)
 
 
 def as_given(config: Config) -> Config:
@@ -233,12 +233,12 @@ def as_given(config: Config) -> Config:
     if line is None or not line.optics_assumed or standards_of(config).optics != line.optics:
         return config
     update = dict.fromkeys(("optics", "covariance", "height_nm"), None) | {"optics_assumed": False}
-    return config.model_copy(update={"calibration": line.model_copy(update=update)})
+    return config.changed(calibration=update)
 
 
 def contrast_over(config: Config, standards: Standards) -> tuple[float, str]:
     """Give the contrast per mass over that of standards, and why it cannot be converted."""
-    config = config.model_copy(update={"calibration": None})
+    config = config.changed(calibration=None)
     reach_nm = PEAK_SEARCH_RADIUS * config.optics.wavelength_nm / config.optics.na
     rises = (
         forward_model(config, reach_nm).peak_contrast(config.particle.nominal_height_nm, 1e-3) > 0

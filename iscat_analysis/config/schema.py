@@ -7,8 +7,8 @@ beside it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Self
+from collections.abc import Iterator, Mapping
+from typing import Any, Self
 
 from pydantic import Field, model_validator
 
@@ -77,6 +77,25 @@ class Config(Section):
     def _refusals(self) -> Iterator[str]:
         for part in (_of_background, _of_particle, _of_fit, _of_template):
             yield from part(self)
+
+    def changed(self, **sections: Mapping[str, Any] | Section | None) -> Config:
+        """Replace keys of sections by values that are known to be valid.
+
+        Parameters
+        ----------
+        **sections : mapping, Section or None
+            The keys of a section that change, or what takes its place.
+
+        Returns
+        -------
+        Config
+            Its other keys are as they were.
+        """
+        update = {
+            name: getattr(self, name).model_copy(update=new) if isinstance(new, Mapping) else new
+            for name, new in sections.items()
+        }
+        return self.model_copy(update=update)
 
     @property
     def heights_free(self) -> bool:

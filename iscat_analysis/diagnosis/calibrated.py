@@ -136,8 +136,7 @@ class Prepared:
 
 def within(config: Config, frames: tuple[int, int] | None) -> Config:
     """Fit some frames only."""
-    fit = config.fit.model_copy(update={"frames": frames})
-    return config.model_copy(update={"fit": fit})
+    return config.changed(fit={"frames": frames})
 
 
 Step = Callable[[Prepared], tuple[Prepared, Sequence[Finding | None]]]

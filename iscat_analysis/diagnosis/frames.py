@@ -167,11 +167,10 @@ def without_repeats(movie: Stack, config: Config, camera: Camera) -> KeptFrames:
     if not missing.size or min(part.size for part in kept) < 2:  # nothing else is there
         return KeptFrames(movie, config, config)
     middle = kept[0].size if before is not None else 0
-    background, fit = config.background, config.fit
-    if before is not None:
-        background = background.model_copy(update={"frames": (0, middle)})
-    fit = fit.model_copy(update={"frames": (middle, numbers.size)})
-    own = config.model_copy(update={"background": background, "fit": fit})
+    own = config.changed(
+        background={} if before is None else {"frames": (0, middle)},
+        fit={"frames": (middle, numbers.size)},
+    )
     words = {"repeat": "repeats" if missing.size == 1 else "repeat", "are": are(missing.size)}
     words["frames"] = frames_listed(missing)
     finding = REPEATS_LEFT_OUT({**words, "of": used.size}, where=movie.name)

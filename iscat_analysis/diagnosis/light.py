@@ -179,8 +179,7 @@ def _good(pairs: Sequence[Pair], camera: Camera) -> list[Pair]:
 
 def with_drift_correction(config: Config, *, moves: bool) -> Config:
     """Set in the configuration whether the motion of the fixed pattern is divided out."""
-    background = config.background.model_copy(update={"drift_correction": moves})
-    return config.model_copy(update={"background": background})
+    return config.changed(background={"drift_correction": moves})
 
 
 def motion_in(opening: NoiseSurvey) -> str:

@@ -159,9 +159,7 @@ class Checkpoint:
     ) -> None:
         self._folder = folder if identity else None
         self.kept = 0
-        settings = config.model_copy(
-            update={"compute": config.compute.model_copy(update={"workers": 1})}
-        )
+        settings = config.changed(compute={"workers": 1})
         text = json.dumps(
             [version("iscat-analysis"), identity, shape, span, config_to_toml(settings)]
         )

@@ -334,10 +334,7 @@ def _neighbours(
             other = {"polarization_deg": (optics.polarization_deg + 90.0) % 180.0}
             same = optics.polarization == "circular"
         updates = [] if same or (name == _MASK and optics.mask_na > 0) else [(1.0, other)]
-    others = [
-        (step, config.model_copy(update={"optics": optics.model_copy(update=update)}))
-        for step, update in updates
-    ]
+    others = [(step, config.changed(optics=update)) for step, update in updates]
     try:
         return [(step, forward_model(other, reach_nm).image) for step, other in others]
     except ConfigError:

@@ -668,8 +668,12 @@ def wrong_sign(config: Config) -> WrongSign | None:
         return None
     line = config.calibration.gradient_per_kda
     foci = sorted({*np.arange(-800.0, 801.0, 50.0).tolist(), config.optics.focus_nm})
-    bare = config.model_copy(update={"calibration": None})
-    contrast = {focus: signed_peak(forward_model(_at(bare, focus), 1000.0)) for focus in foci}
+    contrast = {
+        focus: signed_peak(
+            forward_model(config.changed(optics={"focus_nm": focus}, calibration=None), 1000.0)
+        )
+        for focus in foci
+    }
     here = contrast[config.optics.focus_nm]
     most = max(foci, key=lambda focus: abs(contrast[focus]))
     share = abs(here / contrast[most])
@@ -684,7 +688,8 @@ def wrong_sign(config: Config) -> WrongSign | None:
     # of the largest contrast, which a focus to begin with has
     fair = [f for f in foci if contrast[f] * line > 0 and abs(contrast[f] / contrast[most]) > 0.2]
     starts = [focus for focus in fair if focus % 100.0 == 0]  # foci to begin with
-    return WrongSign(config, finding, tuple(_at(config, focus) for focus in starts))
+    begun = tuple(config.changed(optics={"focus_nm": focus}) for focus in starts)
+    return WrongSign(config, finding, begun)
 
 
 def learn_sign(
@@ -769,8 +774,3 @@ def _found(recording: Recording, seen: Collected) -> OpticsCalibration:
         f"of the foci tried {focus:.0f} nm describes the brightest particles best, but not well "
         f"(reduced chi2 {misfit_of(found):.3g}){more}"
     )
-
-
-def _at(config: Config, focus_nm: float) -> Config:
-    optics = config.optics.model_copy(update={"focus_nm": focus_nm})
-    return config.model_copy(update={"optics": optics})

@@ -293,7 +293,7 @@ def accepted(found: OpticsCalibration, config: Config) -> tuple[Config | None, s
     """Give the configuration with the learned optics, or why there is none."""
     if not found.accepted:
         return None, "; ".join(found.measured.refusals)
-    return with_sign(config.model_copy(update={"optics": found.config.optics}))
+    return with_sign(config.changed(optics=found.config.optics))
 
 
 @dataclass(frozen=True)
@@ -505,9 +505,10 @@ def seen_in_field(
 ) -> tuple[Images, Images]:
     """Fit the field, and cut out the particles that are farthest from others."""
     free = config.heights_free
-    fit = config.fit.model_copy(update={"mode": "joint" if free else "mass"})
     rows, columns = windows.after_e.shape
-    context = make_context(config.model_copy(update={"fit": fit}), (rows, columns))
+    context = make_context(
+        config.changed(fit={"mode": "joint" if free else "mass"}), (rows, columns)
+    )
     events, _ = fit_field(context, windows, pool=pool)
     # with free heights what wrong optics leave over is beside particles, which would not be alone
     known = [e.fit.theta for e in events if not (free and Status.SIDELOBE in e.flags)]

@@ -304,7 +304,7 @@ def signal_of(
 
 def build_microscope(config: Config, reach_nm: float, settings: Settings) -> ForwardModel:
     """Make the forward model of other optics, with the model's own mass scale."""
-    changed = with_settings(config, settings).model_copy(update={"calibration": None})
+    changed = with_settings(config, settings).changed(calibration=None)
     seated = not config.heights_free and not config.particle.height_is_open
     highest = config.particle.nominal_height_nm if seated else None
     return forward_model(changed, reach_nm, z_max_nm=highest)
@@ -371,7 +371,7 @@ def with_sign(config: Config) -> tuple[Config | None, str]:
     phase, reason = config.optics.reference_phase_deg, ""
     for turned in (phase, (phase + 360) % 360 - 180):
         update = {"reference_phase_deg": turned, "calibrate": "never", "file": None}
-        learned = config.model_copy(update={"optics": config.optics.model_copy(update=update)})
+        learned = config.changed(optics=update)
         try:
             forward_model(learned, 1000.0)
             return learned, ""

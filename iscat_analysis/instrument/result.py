@@ -200,11 +200,10 @@ class OpticsCalibration:
         name = "reference_phase_deg"
         parameters = self.parameters.copy()
         parameters.loc[parameters["parameter"] == name, "value"] = phase_deg
-        optics = self.config.optics.model_copy(update={name: phase_deg})
         measured = replace(self.measured, settings={**self.measured.settings, name: phase_deg})
         return replace(
             self,
-            config=self.config.model_copy(update={"optics": optics}),
+            config=self.config.changed(optics={name: phase_deg}),
             parameters=parameters,
             measured=measured,
             notes=(note, *self.notes),
@@ -318,8 +317,7 @@ def _with_covariance(config: Config, names: tuple[str, ...], covariance: FloatAr
     """Put the errors beside the values, from where fits take what is common to all events."""
     names, covariance = _without((FOCUS_STEP,), names, covariance)
     errors = OpticsCovariance(names=names, matrix=tuple(map(tuple, covariance.tolist())))
-    optics = config.optics.model_copy(update={"covariance": errors})
-    return config.model_copy(update={"optics": optics})
+    return config.changed(optics={"covariance": errors})
 
 
 def _notes(

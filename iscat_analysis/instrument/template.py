@@ -145,12 +145,11 @@ def measure_template(
     movie, config = ready.steady, ready.config
     pixel = float(config.camera.pixel_size_nm or np.nan)
     roi_nm = config.fit.roi_px(pixel) * pixel
-    physics = config.optics.model_copy(update={"psf": "model", "template": None})
+    physics = config.changed(optics={"psf": "model", "template": None}, calibration=None)
     with threads(config.compute.workers) as pool:
         for number, margin in enumerate(MARGINS_PX):
             progress("particles", number, len(MARGINS_PX))
-            larger = config.fit.model_copy(update={"roi_nm": roi_nm + 2 * margin * pixel})
-            cut = config.model_copy(update={"fit": larger, "optics": physics, "calibration": None})
+            cut = physics.changed(fit={"roi_nm": roi_nm + 2 * margin * pixel})
             recording = Recording(movie, cut, ready.camera, pool, ready.opening)
             alone = _alone(*bright_particle_images(recording))
             if len(alone) >= 18:  # pictures with which a margin is good enough

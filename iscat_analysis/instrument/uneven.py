@@ -139,7 +139,7 @@ class FieldOfView:
             "focus_frame": self.middle if self.in_time else 0,
             "focus_jumps": tuple((frame, 0.0) for frame in self.jumps),
         }
-        return config.model_copy(update={"optics": config.optics.model_copy(update=update)})
+        return config.changed(optics=update)
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ def with_learned_heights(ready: Prepared, run: Run) -> Config:
         # Least spread that is learned: with none the height would be held again.
         "height_sd_nm": min(max(round(spread.sd_nm, 2), 0.1), LARGEST_SD_NM),
     }
-    return config.model_copy(update={"particle": particle.model_copy(update=learned)})
+    return config.changed(particle=learned)
 
 
 def analyse_landings(
@@ -111,8 +111,7 @@ def analyse_landings(
     opening = survey_over(frames, config, camera, span, opening)
     reader, noise, window = opening.reader, opening.noise, opening.window
     run.report(*noise.findings_of(movie.name))
-    sampling = config.posterior.model_copy(update={"enabled": config.samples_posterior})
-    config = config.model_copy(update={"posterior": sampling})
+    config = config.changed(posterior={"enabled": config.samples_posterior})
     searches = sum(boundaries(stop - start, window) for start, stop in stretches)
     node = ChunkNode(frames, camera, config, span, searches, window, noise, lines, reader)
     run.warm_up(node.context)

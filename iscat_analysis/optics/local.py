@@ -165,7 +165,7 @@ class LocalModels:
             if not steps:
                 return model
             local = changed(optics, {base: n * STEPS[base] for base, n in steps})
-            there = config.model_copy(update={"optics": local, "calibration": None})
+            there = config.changed(optics=local, calibration=None)
             return replace(forward_model(there, model.reach_nm), scale=model.scale)
 
         self._moved = memoize(kept, moved)

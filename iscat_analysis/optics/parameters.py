@@ -194,8 +194,7 @@ def with_settings(config: Config, settings: Settings) -> Config:
     plain |= moves_in(config.optics, settings)
     plain |= field_keys({name: settings.get(name, 0.0) for name in FIELD})
     terms = {key: value for key, value in settings.items() if is_term(key) and value}
-    optics = config.optics.model_copy(update={**plain, "aberrations_nm": terms})
-    return config.model_copy(update={"optics": optics})
+    return config.changed(optics={**plain, "aberrations_nm": terms})
 
 
 _HALF_TURN = 180.0  # of the phase, after which particles look the same with the other sign

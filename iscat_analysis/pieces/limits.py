@@ -380,7 +380,6 @@ class _Setups:
         return _At(model, theta, level_e, scale_e, now["n_before"], now["n_after"], light)
 
     def _at_focus(self, focus_nm: float) -> ForwardModel:
-        optics = self._config.optics.model_copy(update={"focus_nm": focus_nm})
-        config = self._config.model_copy(update={"optics": optics, "calibration": None})
+        config = self._config.changed(optics={"focus_nm": focus_nm}, calibration=None)
         model = forward_model(config, self._reach_nm, z_max_nm=self._highest_nm)
         return replace(model, scale=self._scale)

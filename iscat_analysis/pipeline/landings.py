@@ -124,12 +124,11 @@ def inject_and_recover(ready: Prepared, run: Run, result: DetectionResult) -> di
         config = within(config, ready.stretches.main)
     frames = fitted_frames(movie, config)
     window = int(result.summary["window_frames"])
-    fixed = config.background.model_copy(update={"window_frames": window})
     particles = draw_particles(result, movie.shape[1:], frames, window, run.inject)
     lines = result.context.lines if isinstance(result.context.lines, LightModel) else None
     again = analyse_landings(
         InjectedMovie(movie, camera, particles, config.compute.seed, result.trajectory),
-        config.model_copy(update={"background": fixed}),
+        config.changed(background={"window_frames": window}),
         camera,
         Run(progress=run.progress, executor=run.executor),  # the user has been told already
         lines=lines,

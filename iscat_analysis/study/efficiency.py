@@ -176,8 +176,7 @@ def _resolved(setup: Setup, mode: str | None) -> tuple[Config, tuple[str, ...]]:
     config = configure(setup)
     name = config.fit.mode if mode is None else mode
     choice_in("mode", name, OF_DIPOLES)
-    config = config.model_copy(update={"fit": config.fit.model_copy(update={"mode": name})})
-    return config, FREE_PARAMETERS[name]
+    return config.changed(fit={"mode": name}), FREE_PARAMETERS[name]
 
 
 def matched(

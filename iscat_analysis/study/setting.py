@@ -252,19 +252,16 @@ def make_setting(
         refuse_sphere(config, "challenges and the estimators of others are of dipoles")
     pixel_nm = config.camera.pixel_size_nm
     side = config.fit.roi_px(pixel_nm) if pixel_nm else config.bounds.pixels
-    changes: dict[str, Mapping[str, Any]] = {
-        "bounds": {"pixels": side},
-        "fit": {"mode": mode},
-        "optics": MOVING,  # one picture, in the middle of the movie
-    }
-    config = _changed(config, changes)
+    config = config.changed(  # one picture, in the middle of the movie
+        bounds={"pixels": side}, fit={"mode": mode}, optics=MOVING
+    )
     if pixel_nm:
         _check_place(config, side * pixel_nm / 2)
     asked = z_nm if z_nm is not None else config.bounds.z_nm
     height = config.particle.nominal_height_nm if asked is None else asked
     counted = config.optics.interferes and config.bounds.n_before > 0
     level = config.background.slides and counted
-    config = _changed(config, {"background": _background(config)})
+    config = config.changed(background=_background(config))
     if context is None:
         context = make_context(config, (side, side))
     if asked is not None:
@@ -273,10 +270,8 @@ def make_setting(
     if asked is None and "z_nm" in FREE_PARAMETERS[mode]:
         height = _clear_of_ends(config, context, collected, mode, height)
         experiment = _experiment(config, context, height, collected)
-    config = _changed(
-        experiment.config,
-        {"particle": {"photons_per_frame": experiment.config.bounds.photons_per_pixel}},
-    )
+    light = experiment.config.bounds.photons_per_pixel
+    config = experiment.config.changed(particle={"photons_per_frame": light})
     centre = (side - 1) / 2 * context.pixel_nm
     at = config.bounds
     read = config.camera.assumed.read_noise_e
@@ -324,12 +319,12 @@ def _check_height(config: Config, context: AnalysisContext, z_nm: float) -> None
 def _experiment(
     config: Config, context: AnalysisContext, z_nm: float, collected: float | None
 ) -> Experiment:
-    experiment = plan(_changed(config, {"bounds": {"z_nm": z_nm}}), model=context.model)
+    experiment = plan(config.changed(bounds={"z_nm": z_nm}), model=context.model)
     if collected is None:
         return experiment
     photons = config.bounds.photons_per_pixel * collected / experiment.collected
-    changes = {"bounds": {"z_nm": z_nm, "photons_per_pixel": photons}}
-    return plan(_changed(config, changes), model=context.model)
+    changed = config.changed(bounds={"z_nm": z_nm, "photons_per_pixel": photons})
+    return plan(changed, model=context.model)
 
 
 def _clear_of_ends(
@@ -346,12 +341,3 @@ def _clear_of_ends(
         if candidate - low > margin and high - candidate > margin:
             return float(candidate)
     return (low + high) / 2
-
-
-def _changed(config: Config, changes: Mapping[str, Mapping[str, Any]]) -> Config:
-    """Copy a configuration with some keys changed; the values are known to be valid."""
-    sections = {
-        name: getattr(config, name).model_copy(update=dict(values))
-        for name, values in changes.items()
-    }
-    return config.model_copy(update=sections)

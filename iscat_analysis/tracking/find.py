@@ -94,8 +94,7 @@ def held_height_warning(
     free = _rejected(fits[fits["frame"].between(first, last - 1)])
     if free.size == 0 or free.mean() <= 0.5:
         return None
-    track = config.track.model_copy(update={"free": "mass"})
-    config, movie = config.model_copy(update={"track": track}), recording.movie
+    config, movie = config.changed(track={"free": "mass"}), recording.movie
     context = tracking_context(config, (movie.shape[1], movie.shape[2]), last - first)
     try:
         quietly = replace(recording, progress=silent)

@@ -330,8 +330,7 @@ def tracking_context(
     config: Config, field_px: tuple[int, int], frames: int, lines: LightModel | None = None
 ) -> AnalysisContext:
     """Make models and matched filter for single frames."""
-    fit = config.fit.model_copy(update={"mode": config.track.free})
-    tracked = config.model_copy(update={"fit": fit})
+    tracked = config.changed(fit={"mode": config.track.free})
     return make_context(tracked, field_px, searches=frames, lines=lines)
 
 

@@ -311,4 +311,4 @@ def _start(config: Config, cause: Cause | None) -> Config:
         return config
     most = min(config.optics.n_immersion, config.optics.n_glass)
     na = min(config.optics.na + cause.step, 0.5 * (config.optics.na + most))
-    return config.model_copy(update={"optics": config.optics.model_copy(update={"na": na})})
+    return config.changed(optics={"na": na})

@@ -201,7 +201,7 @@ def response_of(
     if pixel is None:
         raise ConfigError("camera.pixel_size_nm is needed")
     grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
-    bare = config.model_copy(update={"calibration": None})
+    bare = config.changed(calibration=None)
     errors = config.optics.covariance or OpticsCovariance(names=(), matrix=())
     learned = errors.of_the_middle
     names = learned.names if names is None else tuple(names)
@@ -235,16 +235,12 @@ def at_standards(config: Config) -> Config:
     if line is None or line.optics is None:
         return config
     height = config.particle.nominal_height_nm if line.height_nm is None else line.height_nm
-    camera = config.camera
-    if line.camera is not None and line.camera.pixel_size_nm is not None:
-        camera = camera.model_copy(update={"pixel_size_nm": line.camera.pixel_size_nm})
-    return config.model_copy(
-        update={
-            "optics": line.optics.model_copy(update={"covariance": line.covariance}),
-            "particle": config.particle.held_at(height),
-            "camera": camera,
-            "fit": config.fit.model_copy(update={"mode": "mass"}),
-        }
+    pixel = None if line.camera is None else line.camera.pixel_size_nm
+    return config.changed(
+        optics=line.optics.model_copy(update={"covariance": line.covariance}),
+        particle=config.particle.held_at(height),
+        camera={} if pixel is None else {"pixel_size_nm": pixel},
+        fit={"mode": "mass"},
     )
 
 

@@ -375,8 +375,7 @@ def _of_configured_optics(tested: Mapping[str, Any], config: Config, table: pd.D
     """Give the error that configured optics may have, by the images on which they were tested."""
     errors = OpticsCovariance(names=tested["names"], matrix=tested["covariance"])
     field = config.optics.field_px or tested.get("field_px")
-    optics = config.optics.model_copy(update={"covariance": errors, "field_px": field})
-    return _of_the_optics(config.model_copy(update={"optics": optics}), table)
+    return _of_the_optics(config.changed(optics={"covariance": errors, "field_px": field}), table)
 
 
 def _is_about_contrast(config: Config) -> bool:
@@ -628,24 +627,17 @@ class _Offset:
 
 def _moved(key: str, config: Config, step: float) -> Config:
     """Move an input, and leave the stage where it is."""
-    update: dict[str, Any] = {"calibration": None}
+    config = config.changed(calibration=None)
     if key == "index":
         index = np.sqrt(material(config.particle, config.optics.wavelength_nm).permittivity) + step
         permittivity = float((index**2).real), float((index**2).imag)
-        particle = config.particle.model_copy(update={"permittivity": permittivity, "index": None})
-        update |= {"particle": particle}
-    elif key == "height_nm":
+        return config.changed(particle={"permittivity": permittivity, "index": None})
+    if key == "height_nm":
         height, optics = config.particle.nominal_height_nm + step, config.optics
         # the oil, which the nominal height and the focus set together, stays
         focus = optics.focus_nm + step * (1 - optics.n_immersion / optics.n_sample)
-        update |= {
-            "particle": config.particle.held_at(height),
-            "optics": optics.model_copy(update={"focus_nm": focus}),
-        }
-    else:
-        value = float(getattr(config.optics, key)) + step
-        update |= {"optics": config.optics.model_copy(update={key: value})}
-    return config.model_copy(update=update)
+        return config.changed(particle=config.particle.held_at(height), optics={"focus_nm": focus})
+    return config.changed(optics={key: float(getattr(config.optics, key)) + step})
 
 
 SCALE = "scale of the model", "measure standards (iscat calibrate mass)"
