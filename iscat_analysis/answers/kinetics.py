@@ -37,7 +37,7 @@ from scipy.special import chdtrc, exprel, kolmogorov
 
 from iscat_analysis.calibration.line import Line
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.findings import Finding
+from iscat_analysis.findings import Finding, Noted
 from iscat_analysis.findings.tables import CHANCE_PAIRS, NO_DEPLETION_LAW, PARTLY_SEARCHED
 from iscat_analysis.inference.checks import number_in, shown
 from iscat_analysis.reading import read_text, toml_of
@@ -203,7 +203,7 @@ _CHANCE = 0.1  # part of the pairs
 
 
 @dataclass(frozen=True)
-class Kinetics:
+class Kinetics(Noted):
     """Rates of one table; `fit_kinetics` makes it.
 
     Attributes
@@ -227,11 +227,6 @@ class Kinetics:
     findings: tuple[Finding, ...]
 
     __repr__ = brief
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences of the findings."""
-        return tuple(finding.text for finding in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
         """Give everything as plain values.

@@ -36,7 +36,7 @@ from iscat_analysis.config import (
     toml_value,
 )
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.findings import Finding
+from iscat_analysis.findings import Finding, Noted
 from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, forward_model
 from iscat_analysis.reading import is_file, is_folder
 from iscat_analysis.records import FloatArray, Status
@@ -86,7 +86,7 @@ class ContrastPeak:
 
 
 @dataclass(frozen=True, eq=False)
-class MassCalibration:
+class MassCalibration(Noted):
     """The line between contrast and mass; `calibrate_mass` makes it."""
 
     gradient_per_kda: float
@@ -100,11 +100,6 @@ class MassCalibration:
     events: int
     findings: tuple[Finding, ...] = ()
     recorded: Standards | None = None
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences of the findings."""
-        return tuple(finding.text for finding in self.findings)
 
     def mass_kda(self, contrast: ArrayLike) -> FloatArray:
         """Convert signed peak contrasts to masses."""

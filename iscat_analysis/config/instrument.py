@@ -293,6 +293,11 @@ class Optics(FieldTerms):
         return self.kind.interferes
 
     @property
+    def resolution_nm(self) -> float:
+        """Length λ/NA [nm]."""
+        return self.wavelength_nm / self.na
+
+    @property
     def direction(self) -> float:
         """Sign of the incident light's direction along the axis of the collected light."""
         return self.kind.direction
@@ -392,6 +397,11 @@ class CameraConfig(Section):
     those of the calibration's standards; 1: the light at the centre"""
     fill_factor: FillFactor = 1.0
     """share of a pixel's area that detects light, a square at its centre"""
+
+    @property
+    def pixel_nm(self) -> float:
+        """Pixel size in the sample plane [nm], NaN where it is not known."""
+        return self.pixel_size_nm or math.nan
 
     @property
     def assumed(self) -> CameraConfig:

@@ -103,6 +103,11 @@ class Config(Section):
         return self.track.heights_free if self.fit.follows_tracks else self.fit.heights_free
 
     @property
+    def roi_px(self) -> int:
+        """Side of the square that is fitted, in pixels."""
+        return self.fit.roi_px(self.camera.pixel_nm)
+
+    @property
     def fits_sizes(self) -> bool:
         """Whether the diameters of spheres are fitted, from which their masses follow."""
         return self.particle.is_sphere and self.fit.masses_free

@@ -12,6 +12,7 @@ from iscat_analysis.findings.registry import (
     Finding,
     FindingKind,
     Findings,
+    Noted,
     Severity,
     Subject,
     Value,

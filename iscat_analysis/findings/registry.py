@@ -215,6 +215,17 @@ def warnings_in(findings: Iterable[Finding]) -> list[str]:
     return [finding.text for finding in findings if finding.severity is not Severity.NOTE]
 
 
+class Noted:
+    """A result with findings."""
+
+    findings: tuple[Finding, ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences of the findings."""
+        return tuple(finding.text for finding in self.findings)
+
+
 def existing(findings: Iterable[Finding | None]) -> list[Finding]:
     """Leave out what was looked for and not found."""
     return [finding for finding in findings if finding is not None]

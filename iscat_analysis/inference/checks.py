@@ -85,15 +85,15 @@ def pixels_of(
     return array
 
 
-def mask_of(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:
+def mask_of(value: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:
     """Check a mask."""
     if value is None:
         return np.zeros(shape, dtype=np.bool_)
     array = np.asarray(value)
     if array.dtype != np.bool_:
-        raise DataError(f"{name}: holds {array.dtype}; give True where a pixel must not be used")
+        raise DataError(f"masked: holds {array.dtype}; give True where a pixel must not be used")
     if array.shape != shape:
-        raise DataError(f"{name}: has shape {array.shape}; give an array of shape {shape}")
+        raise DataError(f"masked: has shape {array.shape}; give an array of shape {shape}")
     return array
 
 

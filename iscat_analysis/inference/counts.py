@@ -52,7 +52,7 @@ def conditional(
 
     Shapes: `before_e, after_e` (ny, nx), `masked` (ny, nx).
     """
-    masked = mask_of("masked", masked, grid.shape)
+    masked = mask_of(masked, grid.shape)
     before = pixels_of("before_e", before_e, grid.shape, masked)
     after = pixels_of("after_e", after_e, grid.shape, masked)
     ratio = pixels_of("power_ratio", power_ratio, grid.shape, masked, scalar=True)
@@ -97,7 +97,7 @@ def poisson(
 
     Shapes: `counts_e` (ny, nx), `masked` (ny, nx).
     """
-    masked = mask_of("masked", masked, grid.shape)
+    masked = mask_of(masked, grid.shape)
     counts = pixels_of("counts_e", counts_e, grid.shape, masked)
     names = "background_e", "scale_e", "extra_variance_e2"
     background, scale, extra = (
@@ -131,7 +131,7 @@ def gaussian(
 
     Shapes: `contrast, sigma` (ny, nx), `masked` (ny, nx).
     """
-    masked = mask_of("masked", masked, grid.shape)
+    masked = mask_of(masked, grid.shape)
     seen = pixels_of("contrast", contrast, grid.shape, masked)
     spread = pixels_of("sigma", sigma, grid.shape, masked, scalar=True)
     used = ~masked & (spread > 0)
@@ -216,7 +216,7 @@ def counts_likelihood(
     if noise == CONDITIONAL:
         counts = before_e, after_e, power_ratio * (1 + signal)
         return conditional(model, grid, *counts, read_variances_e2=read_variances_e2, masked=masked)
-    masked = mask_of("masked", masked, grid.shape)
+    masked = mask_of(masked, grid.shape)
     before = pixels_of("before_e", before_e, grid.shape, masked, scalar=True)
     read_before, read_after = _read_variances(read_variances_e2, grid, masked)
     steady = smooth_background(before, read_before, masked) if background else before

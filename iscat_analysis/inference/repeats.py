@@ -358,11 +358,11 @@ class _Tiles:
 def _of_windows(own: FloatArray, tiles: _Tiles | None) -> _Found:
     """Ratios from parts of windows, at events and at places without a particle."""
     squares, counts = own[:, :, 0], own[:, :, 1]
-    ratio2, variance = _mean_square(squares[:, 0], counts[:, 0], 2.0)
+    ratio2, variance = _mean_square(squares[:, 0], counts[:, 0])
     degrees = max(len(own), counts[:, 0].sum() / 4)
     total = counts.sum(axis=0)[1:]
     kept = [k for k, number in enumerate(total) if number >= 2]
-    curve = tuple(_mean_square(squares[:, k + 1], counts[:, k + 1], 2.0) for k in kept)
+    curve = tuple(_mean_square(squares[:, k + 1], counts[:, k + 1]) for k in kept)
     levels: tuple[float, ...] = ()
     if tiles is not None:
         whole, parts, *others = tiles.mean
@@ -384,11 +384,11 @@ def _of_frames(tiles: _Tiles, distances: tuple[float, ...]) -> _Found:
     )  # fmt: skip
 
 
-def _mean_square(squares: FloatArray, counts: FloatArray, excess: float) -> tuple[float, float]:
+def _mean_square(squares: FloatArray, counts: FloatArray) -> tuple[float, float]:
     """Mean square, and its variance: that between events, and at least that of χ²."""
     total = float(counts.sum())
     mean = float(squares.sum()) / total
-    chi2 = excess * mean**2 / total
+    chi2 = 2 * mean**2 / total
     events = len(squares)
     if events < 2:
         return mean, chi2

@@ -204,7 +204,7 @@ def bright_places(
     variance = windows.after_e + windows.read_variance_after_e2 + ratio**2 * noise_before
     used = ~windows.masked & (windows.before_e > 0) & (windows.after_e > 0)
     energy = energy_of(windows.after_e - ratio * windows.before_e, variance, used, _spot_px(config))
-    pixel, cut_out = _pixel_nm(config), _cutter(windows, config)
+    pixel, cut_out = config.camera.pixel_nm, _cutter(windows, config)
     images, others = (
         [
             cut_out(row, column, side)
@@ -212,20 +212,20 @@ def bright_places(
                 energy, pixel_nm=pixel, alone_nm=apart_nm, roi_px=side
             )
         ]
-        for apart_nm, side in ((alone_nm, _roi_px(config)), (0.0, round(OTHERS_NM / pixel)))
+        for apart_nm, side in ((alone_nm, config.roi_px), (0.0, round(OTHERS_NM / pixel)))
     )
     seen = _bright(_among(image, others, SAME_NM) for image in images)
     return seen, [_among(other, others, SAME_NM) for other in others]
 
 
 def known_places(
-    windows: Windows, config: Config, known: Sequence[FloatArray], least: int
+    windows: Windows, config: Config, known: Sequence[FloatArray]
 ) -> tuple[Images, Images]:
     """Cut out particles that are known, those that are farthest from others.
 
     Shapes: `known` (5,).
     """
-    pixel, cut_out = _pixel_nm(config), _cutter(windows, config)
+    pixel, cut_out = config.camera.pixel_nm, _cutter(windows, config)
     heights = config.fit.z_range_nm if config.heights_free else None
 
     def cut(chosen: FloatArray, side: int) -> Images:
@@ -238,16 +238,16 @@ def known_places(
     thetas = np.array(known).reshape(-1, PRIVATE)
     places_nm = thetas[:, :2]
     others = cut(thetas, round(OTHERS_NM / pixel))
-    room = (_roi_px(config) // 2 + 1) * pixel
+    room = (config.roi_px // 2 + 1) * pixel
     far = np.array(windows.after_e.shape[::-1]) * pixel - room
     inside = ((places_nm >= room) & (places_nm < far)).all(axis=1)
     apart = np.hypot(*(places_nm[:, None] - places_nm).transpose(2, 0, 1))
     np.fill_diagonal(apart, np.inf)
     nearest = apart.min(axis=1, initial=np.inf)[inside]
-    seen = [_among(image, others, 0.0) for image in cut(thetas[inside], _roi_px(config))]
+    seen = [_among(image, others, 0.0) for image in cut(thetas[inside], config.roi_px)]
     for alone_nm in (APART_NM, 1600.0, 1300.0, 1000.0, 700.0):
         images = _bright(s for s, d in zip(seen, nearest, strict=True) if d >= alone_nm)
-        if len(images) >= least:
+        if len(images) >= LEAST_IMAGES:
             break
     return images, [_among(other, others, 0.0) for other in others]
 
@@ -262,7 +262,7 @@ def _cutter(windows: Windows, config: Config) -> Callable[[int, int, int], Parti
         (top, bottom), (left, right) = _region(row, column, side)
         rows = max(top, 0), min(bottom, shape[0])
         columns = max(left, 0), min(right, shape[1])
-        grid = PixelGrid.region(rows, columns, _pixel_nm(config))
+        grid = PixelGrid.region(rows, columns, config.camera.pixel_nm)
         part = windows.cut((slice(*rows), slice(*columns)))
         counts = model, grid, part.before_e, part.after_e, windows.power_ratio
         reads = part.read_variance_before_e2, part.read_variance_after_e2
@@ -308,7 +308,7 @@ def scan_particle_images(recording: Recording) -> Images:
     ]
     energy = np.mean(energies, axis=0) * math.sqrt(len(energies))
     places = find_bright_places(
-        energy, pixel_nm=_pixel_nm(config), alone_nm=ALONE_NM, roi_px=_roi_px(config)
+        energy, pixel_nm=config.camera.pixel_nm, alone_nm=ALONE_NM, roi_px=config.roi_px
     )
     model = build_microscope(config, 1000.0, settings_of(config))
     saturated = np.any(camera.saturated(counts), axis=0)
@@ -316,8 +316,8 @@ def scan_particle_images(recording: Recording) -> Images:
     per_place = max(1, MOST_IMAGES // max(len(places), 1))
     taken = np.unique(np.linspace(0, len(frames) - 1, min(per_place, len(frames))).round())
     for row, column in places[:MOST_IMAGES]:
-        region = _region(row, column, _roi_px(config))
-        grid = PixelGrid.region(*region, _pixel_nm(config))
+        region = _region(row, column, config.roi_px)
+        grid = PixelGrid.region(*region, config.camera.pixel_nm)
         cut = slice(*region[0]), slice(*region[1])
         masked = np.asarray(saturated)[cut]
         seen: list[ParticleImage] = []
@@ -358,7 +358,7 @@ def _particle_image_of(
     step: BrightStep, others: Sequence[BrightStep], config: Config, model: ForwardModel
 ) -> ParticleImage:
     """Make an image of a step among others, whose rings may change while its frames are summed."""
-    grid = PixelGrid.region(step.rows, step.columns, _pixel_nm(config))
+    grid = PixelGrid.region(step.rows, step.columns, config.camera.pixel_nm)
     windows = step.windows
     reads = windows.read_variance_before_e2, windows.read_variance_after_e2
     counts = windows.before_e, windows.after_e, windows.power_ratio * step.motion
@@ -378,16 +378,8 @@ def _particle_image_of(
     return replace(_centred(likelihood, config), frames=frames, neighbours=tuple(near))
 
 
-def _pixel_nm(config: Config) -> float:
-    return float(config.camera.pixel_size_nm or math.nan)
-
-
-def _roi_px(config: Config) -> int:
-    return config.fit.roi_px(_pixel_nm(config))
-
-
 def _spot_px(config: Config) -> float:
-    return config.optics.wavelength_nm / config.optics.na / _pixel_nm(config)
+    return config.optics.resolution_nm / config.camera.pixel_nm
 
 
 def _region(row: int, column: int, side: int) -> tuple[tuple[int, int], tuple[int, int]]:

@@ -49,7 +49,6 @@ from iscat_analysis.optics.parameters import (
     FIELD,
     FOCUS_STEP,
     FREE,
-    LEAST_IMAGES,
     Settings,
     change_of,
     free_names,
@@ -512,4 +511,4 @@ def seen_in_field(
     events, _ = fit_field(context, windows, pool=pool)
     # with free heights what wrong optics leave over is beside particles, which would not be alone
     known = [e.fit.theta for e in events if not (free and Status.SIDELOBE in e.flags)]
-    return known_places(windows, config, known, LEAST_IMAGES)
+    return known_places(windows, config, known)

@@ -143,8 +143,8 @@ def measure_template(
         )
     ready = calibrated(movie, config, report=printing(notify))
     movie, config = ready.steady, ready.config
-    pixel = float(config.camera.pixel_size_nm or np.nan)
-    roi_nm = config.fit.roi_px(pixel) * pixel
+    pixel = config.camera.pixel_nm
+    roi_nm = config.roi_px * pixel
     physics = config.changed(optics={"psf": "model", "template": None}, calibration=None)
     with threads(config.compute.workers) as pool:
         for number, margin in enumerate(MARGINS_PX):

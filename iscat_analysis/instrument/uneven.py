@@ -92,8 +92,8 @@ class FieldOfView:
         in_time = background_mode(config) == "sliding"
         frames = fitted_frames(movie, config, config.background.recorded)
         shape = (movie.shape[1], movie.shape[2])
-        pixel = config.camera.pixel_size_nm or math.nan
-        return cls(centre_of(config.optics, shape), pixel, frames, in_time, movie)
+        centre = centre_of(config.optics, shape)
+        return cls(centre, config.camera.pixel_nm, frames, in_time, movie)
 
     @property
     def middle(self) -> int:

@@ -286,7 +286,7 @@ def gather(
             )
     usual = n_after / max(n_before, 1)
     ratio = _ratio_of(usual if power_ratio is None else power_ratio, len(events))
-    pixel_nm = float(config.camera.pixel_size_nm or 0.0)
+    pixel_nm = config.camera.pixel_nm
     rows, columns = events.shape[1:]
     reach = math.hypot(rows + 2, columns + 2) * pixel_nm + window_nm(pixel_nm)
     model = forward_model(config, reach)

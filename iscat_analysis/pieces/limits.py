@@ -89,7 +89,7 @@ def psf(
     mode = "size" if isinstance(particle, Particle) and particle.is_sphere else "joint"
     config = config_of(optics, particle, camera, mode=mode, calibration=options["calibration"])
     side = int(number_in("pixels", options["pixels"], least=1, most=LARGEST_REGION, whole=True))
-    pixel_nm = float(config.camera.pixel_size_nm or 0.0)
+    pixel_nm = config.camera.pixel_nm
     z_nm, mass_kda = options["z_nm"], options["mass_kda"]
     given = {"x_nm": options["x_nm"], "y_nm": options["y_nm"]}
     given["z_nm"] = particle.nominal_height_nm if z_nm is None else z_nm
@@ -315,7 +315,7 @@ class _Setups:
         config = self._config = config_of(optics, particle, camera, mode=mode, calibration=line)
         self.free = config.fit.free
         side = number_in("pixels", given["pixels"], least=2, most=LARGEST_REGION, whole=True)
-        self._pixel_nm = float(config.camera.pixel_size_nm or 0.0)
+        self._pixel_nm = config.camera.pixel_nm
         self.grid = PixelGrid.centred(int(side), self._pixel_nm)
         self._dark = not config.optics.interferes
         # a calibration was measured at the focus of `optics`, not at the focus of the set-up

@@ -115,11 +115,11 @@ def find_bright_steps(
     chunk: Chunk, window: int, config: Config, *, motion: Motion | None = None, mapper: Mapper = map
 ) -> BrightSteps:
     """Find the bright steps of a chunk, which are cut when they are asked for."""
-    pixel_nm = config.camera.pixel_size_nm or math.nan
+    pixel_nm = config.camera.pixel_nm
     moved = None if motion is None else motion.contrast
-    spot_px = config.optics.wavelength_nm / config.optics.na / pixel_nm  # standard deviation
+    spot_px = config.optics.resolution_nm / pixel_nm  # standard deviation
     spots = _spots(chunk, spot_px, _SHADOW_NM / pixel_nm, moved, mapper)
-    return BrightSteps(chunk, spots, window, pixel_nm, config.fit.roi_px(pixel_nm), motion)
+    return BrightSteps(chunk, spots, window, pixel_nm, config.roi_px, motion)
 
 
 def _spots(

@@ -372,11 +372,7 @@ def plan_parts(
 
 def halo_px(config: Config) -> int:
     """Width of the halo of a tile: from a fitted square to the centre of its farthest neighbour."""
-    return math.ceil((LARGEST_IMAGE + 0.5) * _roi_px(config)) + 2
-
-
-def _roi_px(config: Config) -> int:
-    return config.fit.roi_px(config.camera.pixel_size_nm or math.nan)
+    return math.ceil((LARGEST_IMAGE + 0.5) * config.roi_px) + 2
 
 
 def halo_frames(window: int) -> int:
@@ -390,7 +386,7 @@ def choose_tiles(
 ) -> tuple[tuple[int, int], int]:
     """Choose rows and columns of tiles, and the frames of a core, that look at least at halos."""
     side, halo, stride = halo_px(config), halo_frames(window), stride_of(window)
-    smallest = _roi_px(config)
+    smallest = config.roi_px
     per_block = _SUM_BYTES + _moving_bytes(config) + (0 if in_place else _MAP_BYTES)
     # of what counts may take; the images and regions of its steps have the rest
     budget, per_frame = 0.63 * counts_budget(config), per_block / stride

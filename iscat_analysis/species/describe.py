@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 from scipy.special import gammaincinv, logsumexp, ndtr
 
-from iscat_analysis.findings import Finding, Value, existing
+from iscat_analysis.findings import Finding, Noted, Value, existing
 from iscat_analysis.findings import tables as of
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.species.choices import Choice, Chosen, Ladder, LadderFit, Searched, peaks
@@ -68,7 +68,7 @@ _DIGITS = 6  # of the curves in summary.json
 
 
 @dataclass(frozen=True, eq=False)
-class Distribution:
+class Distribution(Noted):
     """Species, curves and verdicts of one set of events; `describe` makes it.
 
     Attributes
@@ -112,11 +112,6 @@ class Distribution:
     ladder: LadderFit | None = None
 
     __repr__ = brief
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences of the findings."""
-        return tuple(finding.text for finding in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
         """Give what ``summary.json`` holds under ``distribution``.

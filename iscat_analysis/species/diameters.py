@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.findings import Finding
+from iscat_analysis.findings import Finding, Noted
 from iscat_analysis.findings.tables import LARGE_DIAMETER_ERRORS, SPHERES_LEFT_OUT
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.species.choices import Searched
@@ -60,7 +60,7 @@ LARGEST_ERROR = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Sizes:
+class Sizes(Noted):
     """Populations of diameters; `describe_sizes` makes it.
 
     `populations` has a row for each, by rising median: diameter_nm (median), geometric_sd, fraction
@@ -78,11 +78,6 @@ class Sizes:
     draws: int
     seed: int
     findings: tuple[Finding, ...]
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences of the findings."""
-        return tuple(finding.text for finding in self.findings)
 
     def to_dict(self) -> dict[str, Any]:
         """Give what ``summary.json`` holds under ``sizes``."""

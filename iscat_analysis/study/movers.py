@@ -140,7 +140,7 @@ def _start(
     inside: bool,
 ) -> FloatArray:
     """Place a particle in the field, or around it [nm]."""
-    pixel = config.camera.pixel_size_nm or 0.0
+    pixel = config.camera.pixel_nm
     rows, columns = config.simulation.shape
     z = config.particle.nominal_height_nm if kind.z_nm is None else kind.z_nm
     if kind.z_nm is None and kind.ceiling_nm is not None:
@@ -222,7 +222,7 @@ def _turned(
     config: Config, mean: FloatArray, margin_px: float
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Let what leaves the surroundings of the field on one side enter on the other."""
-    pixel = config.camera.pixel_size_nm or 0.0
+    pixel = config.camera.pixel_nm
     rows, columns = config.simulation.shape
     size = (np.array([columns, rows]) + 2 * margin_px) * pixel
     low = -(0.5 + margin_px) * pixel

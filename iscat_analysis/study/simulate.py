@@ -110,7 +110,7 @@ class Movie:
         simulation = config.simulation
         self._config = config
         self._seed = seed
-        self._pixel_nm = config.camera.pixel_size_nm or 0.0
+        self._pixel_nm = config.camera.pixel_nm
         rate = np.array(simulation.drift_px_per_frame[::-1])
         self.drift_px = np.arange(simulation.frames)[:, None] * rate
         self._margins = self._margins_px()
@@ -443,7 +443,7 @@ def _counted(
 
 
 def _metadata(config: Config) -> dict[str, object]:
-    rate, pixel_um = config.camera.frame_rate_hz, (config.camera.pixel_size_nm or 0.0) / 1000
+    rate, pixel_um = config.camera.frame_rate_hz, config.camera.pixel_nm / 1000
     metadata: dict[str, object] = {"axes": "TYX", "UUID": _NO_UUID}  # random, files would differ
     for axis in "XY":
         metadata |= {f"PhysicalSize{axis}": pixel_um, f"PhysicalSize{axis}Unit": "µm"}
@@ -467,7 +467,7 @@ class SimulatedParticle:
 def place_particles(config: Config, rng: np.random.Generator) -> tuple[SimulatedParticle, ...]:
     """Place the particles that stand still: those that are listed, or so many anywhere."""
     simulation, particle = config.simulation, config.particle
-    pixel_nm = float(config.camera.pixel_size_nm or math.nan)
+    pixel_nm = config.camera.pixel_nm
     nominal = material(particle, config.optics.wavelength_nm).mass_kda
     if simulation.count is None:
         particles = []

@@ -275,7 +275,7 @@ def extrapolated(
     config: Config, field: MovingField, rows: Localizations
 ) -> tuple[Localizations, int]:
     """Add trial rows where slow particles were not detected, at their last and next positions."""
-    reach = config.optics.wavelength_nm / config.optics.na
+    reach = config.optics.resolution_nm
     slow = _steps_nm2(rows) * _BRIDGE_FRAMES <= reach**2
     longer = rows
     for which, direction in ((0, -1), (-1, 1)):
@@ -337,7 +337,7 @@ def bridge(config: Config, rows: Localizations) -> IntArray:
 
     Shapes: result (n,).
     """
-    reach = config.optics.wavelength_nm / config.optics.na
+    reach = config.optics.resolution_nm
     first, last, square = track_ends(rows, 0), track_ends(rows, -1), _steps_nm2(rows)
     gap = first.frame - last.frame[:, None]
     apart = scipy.spatial.distance.cdist(last.theta[:, :2], first.theta[:, :2])

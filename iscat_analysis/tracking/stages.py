@@ -192,11 +192,6 @@ class Task:
         return self.context.config
 
     @property
-    def resolution_nm(self) -> float:
-        """Length λ/NA [nm]."""
-        return self.config.optics.wavelength_nm / self.config.optics.na
-
-    @property
     def heights_free(self) -> bool:
         """Whether particles move along z as well."""
         return bool(self.field.free[2])
@@ -286,7 +281,7 @@ def extend(task: Task, state: State) -> State:
         state = task.fitted(state, _NEXT_TURNS if number else 1)
         rows, added = trimmed(state.rows), 0
         if not task.cautious:
-            reach_nm, near_nm = task.config.track.max_step_nm, task.resolution_nm
+            reach_nm, near_nm = task.config.track.max_step_nm, task.config.optics.resolution_nm
             rows, added = extended(
                 task.field, state.ground, rows, resolution_nm=near_nm, reach_nm=reach_nm
             )
@@ -313,7 +308,7 @@ def identify(task: Task, state: State) -> State:
     if not len(rows.frame):
         return state
     error = mass_error(task.config, rows, typical_error(rows.fisher))
-    rows = identified(rows, near_nm=task.resolution_nm, error=error)
+    rows = identified(rows, near_nm=task.config.optics.resolution_nm, error=error)
     return replace(state, rows=numbered(rows))
 
 
@@ -392,7 +387,7 @@ def _refuse_flood(task: Task, rows: Localizations) -> None:
     area = (task.field.pixel_nm / 1e3) ** 2 * float(task.field.used.sum())
     each = len(rows.frame) / task.field.frames
     # more than 0.15 rows in an area of (λ/NA)² are no particles
-    if each > 0.15 * area / (task.resolution_nm / 1e3) ** 2:
+    if each > 0.15 * area / (task.config.optics.resolution_nm / 1e3) ** 2:
         raise DataError(
             f"{each:.0f} places in every frame of {area:.0f} um2 look like particles, more than "
             "can be told apart: the light changes from frame to frame, as where the stage drifts "
@@ -416,7 +411,7 @@ def _credible(task: Task, rows: Localizations, done: BoolArray) -> Localizations
     rows, done = rows.only(known), done[known]
     kept = done & (rows.theta[:, 3] > 0) & (rows.snr > AS_FOUND * task.context.templates.threshold)
     rows = rows.only(kept)
-    pairs = rows.pairs_within(task.resolution_nm / 4)
+    pairs = rows.pairs_within(task.config.optics.resolution_nm / 4)
     fainter = np.argmin(rows.snr[pairs], axis=1)[:, None]
     return rows.only(~np.isin(np.arange(len(rows.frame)), np.take_along_axis(pairs, fainter, 1)))
 

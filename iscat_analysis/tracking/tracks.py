@@ -287,7 +287,6 @@ def track_setup(context: AnalysisContext, windows: Windows) -> TrackSetup:
     config = context.config
     rows, columns = windows.after_e.shape
     matter = material(config.particle, config.optics.wavelength_nm)
-    resolution_nm = config.optics.wavelength_nm / config.optics.na
     # a refractive index describes a permittivity whose imaginary part is below 1e-6
     absorbs = abs(matter.permittivity.imag) > 1e-6 or matter.permittivity.real <= 0
     return TrackSetup(
@@ -305,7 +304,7 @@ def track_setup(context: AnalysisContext, windows: Windows) -> TrackSetup:
         else float(np.sqrt(matter.permittivity.real)),
         density_kg_m3=matter.density_kg_m3,
         n_medium=config.optics.n_sample,
-        hidden_nm=resolution_nm if background_mode(config) == "tracks" else 0.0,
+        hidden_nm=config.optics.resolution_nm if background_mode(config) == "tracks" else 0.0,
     )
 
 

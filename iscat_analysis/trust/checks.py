@@ -267,13 +267,8 @@ def _with_extension(state: Checked) -> Checked:
     return state.flag(Status.EXTENDED, found.flagged)
 
 
-def _resolution_nm(state: Checked) -> float:
-    optics = state.found.context.config.optics
-    return optics.wavelength_nm / optics.na
-
-
 def _with_changing_light(state: Checked) -> Checked:
-    shared = at_a_shared_place(state.fits, _resolution_nm(state))
+    shared = at_a_shared_place(state.fits, state.found.context.config.optics.resolution_nm)
     return replace(state, shared_place=shared).flag(Status.CHANGING, shared)
 
 
@@ -293,7 +288,9 @@ def _with_fluctuation(state: Checked) -> Checked:
     if result is None:
         return state
     if state.of_landings and result.is_seen:
-        wide = at_a_shared_place(state.fits, _resolution_nm(state), result.relative)
+        wide = at_a_shared_place(
+            state.fits, state.found.context.config.optics.resolution_nm, result.relative
+        )
         state = state.flag(Status.CHANGING, wide)
     sigma = np.sqrt(state.fits["sigma_mass_kda"] ** 2 + result.variance_kda2)
     fits = state.fits.assign(sigma_mass_kda=sigma)

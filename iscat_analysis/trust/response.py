@@ -200,7 +200,7 @@ def response_of(
     pixel = config.camera.pixel_size_nm
     if pixel is None:
         raise ConfigError("camera.pixel_size_nm is needed")
-    grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
+    grid = PixelGrid.centred(config.roi_px, pixel)
     bare = config.changed(calibration=None)
     errors = config.optics.covariance or OpticsCovariance(names=(), matrix=())
     learned = errors.of_the_middle

@@ -358,7 +358,7 @@ def _of_the_optics(config: Config, table: pd.DataFrame) -> Sigmas:
     errors, pixel = config.optics.covariance, config.camera.pixel_size_nm
     if errors is None or not errors.names or pixel is None or not _predicts_pictures(config):
         return {}
-    grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
+    grid = PixelGrid.centred(config.roi_px, pixel)
     known = table[["z_nm", "mass_kda"]].notna().all(axis=1).to_numpy()
     model = forward_model(config, 1.05 * grid.diagonal_nm / 2)
     shifts = np.full((len(table), len(COMMON), len(errors.names)), np.nan)
