@@ -26,9 +26,9 @@ from iscat_analysis.report.pictures import picture_uri
 from iscat_analysis.report.vega import VegaFigure, columns_of, figure, libraries, look_of, payload
 from iscat_analysis.text import in_page, in_terminal
 
-BLUE, VERMILLION, GREEN, PURPLE = "#0072b2", "#d55e00", "#009e73", "#cc79a7"
+BLUE, VERMILLION = "#0072b2", "#d55e00"
 GREY, LINE = "#a9afb7", "#7d858f"
-PALETTE = (VERMILLION, BLUE, GREEN, PURPLE, "#e69f00", "#56b4e9", LINE)
+PALETTE = (VERMILLION, BLUE, "#009e73", "#cc79a7", "#e69f00", "#56b4e9", LINE)
 """Colours that can be told apart, by night as well."""
 
 NAMED = 12
@@ -257,7 +257,7 @@ def heatmap(name: str, rows: list[Row], words: Mapping[str, Any] | None = None) 
     look |= {
         "type": "quantitative" if signed else "nominal",
         "angle": -45 if signed else 0,
-        "opacity": 1 if signed else 0.6,
+        "opacity": 1 if signed else 0.75,
         "height": 26 * len({row["row"] for row in rows}),
     }
     named = _shown([{**row, "series": "" if signed else row["value"]} for row in rows])
@@ -402,7 +402,7 @@ def _chart(
     else:
         heading = {"title": {"text": panels[0], "anchor": "start"}} if any(panels) else {}
         width = inner["width"] if drawn.name == "picture" else "container"
-        for key in ("facet", "spec", "resolve"):
+        for key in ("facet", "spec", "resolve", "spacing"):
             made.pop(key, None)
         made |= {**inner, "width": width, **heading}
     return Chart(id, replace(drawn, specification=made), look.get("wide", len(panels) > 1))
