@@ -9,15 +9,16 @@ import numpy as np
 import panel as pn
 
 import iscat_analysis as ia
+from iscat_analysis.report.numbers import parameter
+from iscat_analysis.report.pictures import grey_png
 from iscat_app.chosen import Chosen, Notice
-from iscat_app.widgets import Picture, listing
+from iscat_app.widgets import listing
 
 _PIXELS = 61
 _COLUMNS = (
     " | CRB, alone | CRB, together | QCRB",
     "{name} | {crb_single:.4g} | {crb_joint:.4g} | {qcrb:.4g}",
 )
-_NAMES = {"x_nm": "x [nm]", "y_nm": "y [nm]", "z_nm": "z [nm]", "mass_kda": "mass [kDa]"}
 _SLIDERS = {
     "optics.na": ("NA", 0.8, 1.48, 0.01, 1.42),
     "optics.focus_nm": ("Focus [nm]", -1000, 1000, 10, -300),
@@ -47,9 +48,7 @@ class Bounds:
         self._mode = pn.widgets.Select(
             label="Free", width=150, value="joint", options=["mass", "localize", "joint"]
         )
-        self._picture = Picture(300)
-        self._picture.fit(_PIXELS, _PIXELS)
-        self._picture.figure.title.text = "What the camera sees of it"
+        self._picture = pn.pane.PNG(None, width=300, alt_text="what the camera sees of a particle")
         self._table, self._note = pn.pane.HTML(""), pn.pane.HTML("")
         self._notice.watch(self._follow, *self._sliders.values(), self._mode)
         self.body = pn.Column(
@@ -57,7 +56,7 @@ class Bounds:
             pn.FlexBox(
                 pn.Column(*self._sliders.values(), self._mode),
                 pn.Column(self._table, self._note),
-                pn.pane.Bokeh(self._picture.figure),
+                self._picture,
             ),
         )
 
@@ -91,8 +90,8 @@ class Bounds:
         found, image, took_s = computed
         self._seen = True
         most = float(np.abs(image).max()) or 1.0
-        self._picture.show(image, -most, most)
-        rows = [row | {"name": _NAMES[name]} for name, row in found.actual.T.to_dict().items()]
+        self._picture.object = grey_png((image / most + 1) / 2, _PIXELS)
+        rows = [row | {"name": parameter(name)} for name, row in found.actual.T.to_dict().items()]
         self._table.object = listing(rows, *_COLUMNS)
         peak = 100 * image.flat[np.abs(image).argmax()]
         self._note.object = (

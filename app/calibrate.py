@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import panel as pn
-from bokeh.events import DoubleTap, Tap
-from bokeh.models import Range1d, Whisker
 
 from iscat_analysis.answers.calibrations import contrast_peaks, mass_calibration
 from iscat_analysis.calibration import ContrastPeak, MassCalibration
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import path_beside
+from iscat_analysis.report.page import curves, marks
+from iscat_analysis.report.vega import figures_in
 from iscat_app import widgets as ui
-from iscat_app.chosen import Chosen, Notice, masses_in
+from iscat_app.chosen import Chosen, Notice, numbers_in
 from iscat_app.files import listed
 from iscat_app.runs import Job, Kind, Queue
 from iscat_app.settings import Taken
+from iscat_app.widgets import clickable
 
 _STANDARDS = (
     "standard [kDa] | contrast | ± | by the line [kDa] | 95 % | residual [%]",
@@ -43,7 +45,8 @@ class Calibrate:
         self._result: Path | None = None
         self.peaks: list[ContrastPeak] = []
         self.assigned: dict[int, float] = {}  # masses by number of the peak
-        self._make_figures()
+        self._bars = np.zeros(0), np.zeros(1)
+        self._histogram, self._line = ui.Drawn(("pick",), self._clicked), ui.Drawn()
         standards = {"label": "Masses of the standards [kDa]", "placeholder": "66, 146, 480"}
         self._standards = pn.widgets.TextInput(**standards, width=260)
         self._peak = pn.widgets.Select(label="Peak", width=200)
@@ -66,39 +69,13 @@ class Calibrate:
             "### Masses, from standards",
             ui.in_line(self._standards, self._peak, *masses),
             pn.pane.HTML(_HINT),
-            pn.FlexBox(self._histogram_pane, self._line_pane),
+            pn.FlexBox(self._histogram, self._line),
             self._table,
             "### Camera and optics, from the movie that is chosen",
             ui.in_line(self._dark, *measured),
             "### Use a calibration",
             self._taken.body,
         )
-
-    def _make_figures(self) -> None:
-        self._points = ui.source("mass", "contrast", "low", "high")
-        self._line = ui.source("mass", "contrast")
-        self._bars = ui.source("left", "right", "top")
-        self._marks = ui.source("x", "y", "text", "colour")
-        axes = "mass [kDa]", "|contrast| [%]"
-        shown = ui.plot((480, 300), axes, "pan,wheel_zoom,reset,save")
-        shown.line("mass", "contrast", source=self._line, color=ui.RED)
-        shown.scatter("mass", "contrast", source=self._points, size=9, color=ui.BLUE)
-        shown.add_layout(Whisker(base="mass", lower="low", upper="high", source=self._points))
-        peaks = ui.plot((520, 300), ("|contrast| [%]", "events"), "xwheel_zoom,xpan,reset,tap")
-        peaks.y_range = Range1d(0, 1)
-        edges = {"left": "left", "right": "right", "top": "top", "bottom": 0}
-        look = {"line_color": "white", "nonselection_alpha": 1}
-        peaks.quad(**edges, source=self._bars, color=ui.GREY, **look)
-        mark = {"marker": "inverted_triangle", "size": 12, "nonselection_alpha": 1}
-        peaks.scatter("x", "y", source=self._marks, color="colour", **mark)
-        word = {"text_align": "center", "y_offset": -10, "text_font_size": "12px"}
-        word |= {"text_color": "colour", "nonselection_alpha": 1}
-        peaks.text("x", "y", text="text", source=self._marks, **word)
-        for kind in (Tap, DoubleTap):  # of two clicks that are fast the second is the latter
-            peaks.on_event(kind, lambda event: self._clicked(event.x))
-        self._histogram = peaks
-        self._histogram_pane = pn.Column(pn.pane.Bokeh(peaks), visible=False)
-        self._line_pane = pn.Column(pn.pane.Bokeh(shown), visible=False)
 
     def refresh(self) -> None:
         """Show the contrasts of the result that is chosen."""
@@ -112,28 +89,24 @@ class Calibrate:
         if result == self._result and self.peaks:
             return
         self._result, self.peaks = result, []
-        self._histogram_pane.visible, self._line_pane.visible = result is not None, False
-        if result is None:
-            self._notice.say("Choose an analysed movie of standards under Open.")
-            self._bars.data = {"left": [], "right": [], "top": []}
-            self._assign({})
-            return
-        self._notice.say("")
-        with self._notice.told():
-            size, self.peaks = contrast_peaks(result)
-            counts, edges = np.histogram(100 * size, bins=60)
-            self._bars.data = {"left": edges[:-1], "right": edges[1:], "top": counts}
+        self._line.draw(None)
+        self._notice.say("" if result else "Choose an analysed movie of standards under Open.")
+        if result is not None:
+            with self._notice.told():
+                size, self.peaks = contrast_peaks(result)
+                self._bars = np.histogram(100 * size, bins=60)
         self._assign({})
 
     # ---- which peak has which mass ----------------------------------------------------------
 
     def _masses(self) -> list[float]:
-        return sorted(masses_in(self._standards.value))
+        return sorted(numbers_in(self._standards.value))
 
-    def _clicked(self, contrast_percent: float | None) -> None:
-        if self.peaks and contrast_percent is not None:
-            away = [abs(100 * peak.contrast - contrast_percent) for peak in self.peaks]
-            self._notice.tried(lambda: self._give(int(np.argmin(away))))
+    def _clicked(self, _: str, picked: Any) -> None:
+        with self._notice.told():
+            for each in picked:
+                away = [abs(100 * peak.contrast - each["x"]) for peak in self.peaks]
+                self._give(int(np.argmin(away)))
 
     def _give(self, peak: int | None) -> None:
         """Give a peak the next mass, or take its mass back."""
@@ -150,30 +123,25 @@ class Calibrate:
 
     def _assign(self, assigned: dict[int, float]) -> None:
         self.assigned = assigned
-        top = np.asarray(self._bars.data["top"], float)
-        left, right = (np.asarray(self._bars.data[k], float) for k in ("left", "right"))
         places = [100 * peak.contrast for peak in self.peaks]
-        near = [
-            float(top[(right > x - 100 * p.width) & (left < x + 100 * p.width)].max(initial=0.0))
-            for x, p in zip(places, self.peaks, strict=True)
-        ]
-        self._marks.data = {
-            "x": places,
-            "y": [1.08 * y for y in near],
-            "text": [f"{assigned[k]:g} kDa" if k in assigned else "" for k in range(len(places))],
-            "colour": [ui.RED if k in assigned else ui.BLUE for k in range(len(places))],
-        }
-        texts = [
-            f"{k + 1}: {x:.3g} %" + (f", {assigned[k]:g} kDa" if k in assigned else "")
-            for k, x in enumerate(places)
-        ]
+        names = [f"{assigned[k]:g} kDa" if k in assigned else "" for k in range(len(places))]
+        pairs = enumerate(zip(places, names, strict=True), 1)
+        texts = [f"{k}: {x:.3g} %, {name}".removesuffix(", ") for k, (x, name) in pairs]
         peak = self._peak.value if self._peak.value in range(len(texts)) else None
         self._peak.param.update(
             options={text: k for k, text in enumerate(texts)},
             value=0 if texts and peak is None else peak,
         )
-        end = 1.3 * max(top.max(initial=0.0), 1.0)
-        self._histogram.y_range.update(end=end, reset_end=end)
+        if not places:
+            self._histogram.draw(None)
+            return
+        counts, edges = self._bars
+        parts = [marks("bar", "events", edges, counts)]
+        for x, name, known in zip(places, names, self.peaks, strict=True):
+            near = (edges[1:] > x - 100 * known.width) & (edges[:-1] < x + 100 * known.width)
+            top = 1.08 * counts[near].max(initial=0.0)
+            parts.append(marks("point", name or "no mass", [x], [top]))
+        self._histogram.draw(clickable(curves("assigned", parts).figure, "x"))
 
     # ---- calibrations -----------------------------------------------------------------------
 
@@ -197,13 +165,7 @@ class Calibrate:
 
     def _show(self, found: MassCalibration, notes: list[str], out: Path) -> None:
         rows = found.standards.to_dict("records")
-        contrast, error = 100 * found.standards["contrast"].abs(), found.standards["contrast_se"]
-        bars = {"low": contrast - 100 * error, "high": contrast + 100 * error}
-        self._points.data = {"mass": found.standards["mass_kda"], "contrast": contrast, **bars}
-        self._line_pane.visible = True
-        slope, offset = found.gradient_per_kda, found.offset
-        ends = [0.0, 1.1 * max(r["mass_kda"] for r in rows)]
-        self._line.data = {"mass": ends, "contrast": [100 * abs(slope * m + offset) for m in ends]}
+        self._line.draw(figures_in(out / "calibration.html")["standards"])
         self._table.object = ui.listing(rows, *_STANDARDS) + ui.lines([f"saved in {out}", *notes])
         self._taken.refresh()
 

@@ -166,12 +166,12 @@ class Notice:
             after()
 
 
-def masses_in(text: str) -> list[float]:
-    """Read masses that somebody wrote, as in 66, 146."""
+def numbers_in(text: str) -> list[float]:
+    """Read numbers that somebody wrote, as in 66, 146."""
     try:
         return [float(part) for part in text.replace(";", ",").split(",") if part.strip()]
     except ValueError:
-        raise DataError(f"{text}: write masses in kDa, as in 66, 146") from None
+        raise DataError(f"{text}: write numbers, as in 66, 146") from None
 
 
 def link_to(page: Path, text: str) -> str:

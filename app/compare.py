@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,18 +11,21 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import panel as pn
-from bokeh.models import Legend, Whisker
-from bokeh.plotting import figure
 
 import iscat_analysis as ia
 from iscat_analysis.answers.binding import CONCENTRATIONS
 from iscat_analysis.answers.gates import MassHistogram, counted_events, counted_rows, mass_histogram
-from iscat_analysis.report.style import PALETTES
+from iscat_analysis.errors import DataError
+from iscat_analysis.report.answer import MASS
+from iscat_analysis.report.movie_figures import Sample
+from iscat_analysis.report.page import curves, marks
+from iscat_analysis.report.species import binding_charts
+from iscat_analysis.schemas import jsonable
 from iscat_analysis.species.equilibrium import Model
 from iscat_analysis.species.tables import EventTable
 from iscat_app import widgets as ui
-from iscat_app.chosen import Chosen, Notice, link_to, masses_in
-from iscat_app.results import Rejections
+from iscat_app.chosen import Chosen, Notice, link_to, numbers_in
+from iscat_app.results import Rejections, sample_of
 from iscat_app.runs import Job, Queue
 
 _MODELS: dict[str, Model] = {"two M make a dimer": "dimer", "A and B make AB": "ab"}
@@ -46,21 +49,12 @@ class BindingPart:
         fit = self._notice.button("Fit K_D", 110, self._fit, main=True)
         self._inputs = pn.Column()
         self._said = ui.wide_pane()
-        self._points, self._curve = ui.source("x", "y", "low", "high"), ui.source("x", "y")
-        axes = "concentration [nM]", "complexes among the particles"
-        shown = figure(x_axis_type="log", y_range=(0, 1), tools="pan,wheel_zoom,reset,save")
-        shown.update(width=520, height=320)
-        shown.xaxis.axis_label, shown.yaxis.axis_label = axes
-        shown.line("x", "y", source=self._curve, color=ui.RED, line_width=2)
-        shown.scatter("x", "y", source=self._points, size=8, color=ui.BLUE)
-        shown.add_layout(Whisker(base="x", lower="low", upper="high", source=self._points))
-        shown.toolbar.logo = None
-        self._plot = pn.Column(pn.pane.Bokeh(shown), visible=False)
+        self._drawn = ui.Drawn(), ui.Drawn()
         self._names: list[str] = []
         self._notice.watch(lambda: self.show(self._names), self._model)
         self.body = pn.FlexBox(
             pn.Column(self._model, self._masses, self._inactive, self._inputs, fit, width=430),
-            pn.Column(self._plot, self._said, width=560),
+            pn.Column(*self._drawn, self._said, width=680),
         )
 
     def show(self, names: list[str]) -> None:
@@ -90,22 +84,20 @@ class BindingPart:
         ]
         samples = pd.DataFrame(rows, columns=["path", *columns])
         if len(tables) < 2 or samples[list(columns)].isna().any(axis=None):
-            raise ia.DataError("Choose two results or more, and give all concentrations.")
-        options: Any = {"masses_kda": masses_in(self._masses.value) or None}
+            raise DataError("Choose two results or more, and give all concentrations.")
+        options: Any = {"masses_kda": numbers_in(self._masses.value) or None}
         options |= {"inactive": self._inactive.value, "model": model, "tables": tables}
         fit = partial(ia.fit_kd, samples, **options)
         self._notice.work("Fitting K_D", fit, self._show_fit)
 
     def _show_fit(self, found: ia.Binding) -> None:
-        fit, curve = found.fit, found.curve
-        total = found.samples[list(CONCENTRATIONS[found.model])].sum(axis=1)
-        rows = found.samples.assign(total=total)
-        columns = {"x": "total", "y": "complexes", "low": "complexes_low", "high": "complexes_high"}
-        self._points.data = {name: rows[column] for name, column in columns.items()}
-        self._plot.visible = True
-        if not len(curve):  # of two partners, what the equilibrium says of each table
-            curve = rows.sort_values("total")[["total", "predicted"]]
-        self._curve.data = dict(zip("xy", (curve.iloc[:, 0], curve.iloc[:, 1]), strict=True))
+        fit = found.fit
+        rows = found.samples.assign(
+            total=found.samples[list(CONCENTRATIONS[found.model])].sum(axis=1)
+        )
+        charts = binding_charts(jsonable(found.to_dict()))
+        for drawn, chart in zip(self._drawn, charts, strict=True):
+            drawn.draw(chart.figure)
         high = "∞" if math.isinf(fit.kd_high) else f"{fit.kd_high:.4g}"
         said = (
             f"K_D = {fit.kd_nm:.4g} nM (95 %: {fit.kd_low:.4g} to {high} nM); "
@@ -143,13 +135,14 @@ class Compare:
         self._chosen, self._queue = chosen, queue
         self._notice = Notice()
         self.samples: list[tuple[str, MassHistogram]] = []
+        self.axis = ""
         self._paths = pn.widgets.MultiSelect(
             label="Results (Ctrl for several)", options=[], size=10, width=430
         )
-        self._bin = ui.number("Bar width [kDa]", 10.0, 130, start=0.01)
+        self._bin = ui.number("Bar width", 10.0, 130, start=1e-6)
         self._stacked = pn.widgets.Checkbox(label="one above the other")
         test = self._notice.button("Test whether they differ", 200, self._test, main=True)
-        self._plot = pn.pane.Bokeh(None)
+        self._drawn = ui.Drawn()
         day = self._notice.button("Analyse the folder as a day", 200, self._start_day)
         self._pages = pn.pane.HTML("")
         self._binding = BindingPart(self._notice, self._events)
@@ -158,7 +151,7 @@ class Compare:
         chosen_ones = pn.Column(self._paths, ui.in_line(self._bin, self._stacked), test, width=460)
         binding = ("### Binding", self._binding.body)
         of_day = ("### The day", pn.pane.HTML(_DAY), ui.in_line(day, self._pages))
-        shown = pn.FlexBox(chosen_ones, self._plot)
+        shown = pn.FlexBox(chosen_ones, self._drawn)
         self.body = pn.Column(self._notice.pane, shown, self._table, *binding, *of_day)
 
     def refresh(self) -> None:
@@ -173,59 +166,57 @@ class Compare:
             kept = [path for path in self._paths.value if path in options.values()]
             self._paths.param.update(options=options, value=kept)
         pages = sorted(place.parent.glob("*/batch.html"))
-        self._pages.object = " · ".join(
-            link_to(page, f"Page of {page.parent.name}") for page in pages
-        )
+        links = [link_to(page, f"Page of {page.parent.name}") for page in pages]
+        self._pages.object = " · ".join(links)
 
     def _start_day(self) -> None:
         folder = self._chosen.wanted_movie.parent
         self._queue.add(Job(folder, self._chosen.config, folder / DAY, "day"))
         self._notice.say("The day is in the queue: Run shows how far it is.")
 
-    def _tables(self) -> list[tuple[str, Any]]:
-        """Read the events that count: ok, and not rejected."""
-        tables = []
+    def _chosen_samples(self) -> Iterator[tuple[Path, str, Sample]]:
+        """Give the events that count of each result: ok, and not rejected."""
         for text in self._paths.value:
             path = Path(text)
             with ia.open_result(path) as result:
                 rejected = Rejections(path).events(result.table)
-                table = result.table[counted_rows(result.table, rejected=rejected)]
+                rows = result.table[counted_rows(result.table, rejected=rejected)]
                 name = path.stem + (f" (without {len(rejected)})" if rejected else "")
-                tables.append((name, table))
-        return tables
+                yield path, name, sample_of(result, rows.reset_index(drop=True))
 
     def _events(self) -> list[tuple[str, EventTable]]:
         """Take them as events, with what the search of each result missed."""
-        paths = [Path(text) for text in self._paths.value]
-        return [
-            (name, counted_events(path, table))
-            for path, (name, table) in zip(paths, self._tables(), strict=True)
-        ]
+        found = []
+        for path, name, sample in self._chosen_samples():
+            if sample.quantity is not MASS:
+                raise DataError(f"{name}: has no masses but {sample.quantity.axis}; calibrate it")
+            found.append((name, counted_events(path, sample.rows)))
+        return found
 
     def _draw(self) -> None:
         self._notice.say("")
         self._binding.show([Path(text).stem for text in self._paths.value])
+        found = [(name, sample) for _, name, sample in self._chosen_samples()]
+        axes = {sample.quantity.axis for _, sample in found}
+        if len(axes) > 1:
+            raise DataError(f"These results cannot be compared: {', '.join(sorted(axes))}.")
+        self.axis, wide = "".join(axes), self._bin.value
         self.samples = [
-            (name, mass_histogram(table["mass_kda"].to_numpy(float), bin_kda=self._bin.value))
-            for name, table in self._tables()
+            (name, mass_histogram(sample.values[0], bar=wide)) for name, sample in found
         ]
-        axes = "|mass| [kDa]", f"share of events per {self._bin.value:g} kDa"
-        shown = ui.plot((640, 420), axes, "xwheel_zoom,pan,reset,save")
-        shown.add_layout(Legend(click_policy="hide"), "right")
-        colours = PALETTES["colour-blind safe"]
         shares = [seen.counts / max(seen.counts.sum(), 1.0) for _, seen in self.samples]
-        most = max((share.max() for share in shares), default=1)
-        for place, ((name, seen), share) in enumerate(zip(self.samples, shares, strict=True)):
-            lift = 1.1 * most * place if self._stacked.value else 0.0
-            x, y = np.repeat(seen.edges, 2)[1:-1], np.repeat(share, 2) + lift
-            look = {"color": colours[place % len(colours)], "line_width": 2}
-            shown.step(x, y, mode="after", legend_label=name, **look)
-        self._plot.object = shown
+        step = 1.1 * max((share.max() for share in shares), default=1) * self._stacked.value
+        parts = [
+            marks("line", name, np.repeat(seen.edges, 2)[1:-1], np.repeat(share, 2) + k * step)
+            for k, ((name, seen), share) in enumerate(zip(self.samples, shares, strict=True))
+        ]
+        words = {"x": self.axis, "wide": f"{wide:g}"}
+        self._drawn.draw(curves("samples", parts, words).figure if parts else None)
 
     def _test(self) -> None:
         named = self._events()
         if len(named) < 2:
-            raise ia.DataError("Choose two or more results.")
+            raise DataError("Choose two or more results.")
         names, tables = zip(*named, strict=True)
         compare = partial(ia.compare_tables, tables)
         self._notice.work("Comparing", compare, lambda found: self._tell(names, found))

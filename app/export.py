@@ -58,7 +58,7 @@ class Export:
         }
         self._buttons = [
             pn.widgets.FileDownload(
-                callback=partial(_in_memory, make),
+                callback=lambda make=make: io.BytesIO(make()),
                 filename=f"histogram.{ending}",
                 label=name,
                 width=240,
@@ -95,7 +95,7 @@ class Export:
 
     def _figure(self, kind: Format) -> bytes:
         results = self._results
-        if results.histogram is None or results.result is None:
+        if results.histogram is None or results.result is None or results.sample is None:
             raise ia.DataError("there is no histogram yet")
         shape: dict[str, Any] = {"size_cm": (self._width.value, self._height.value)}
         shape |= {"font": (self._family.value, self._font.value), "palette": self._palette.value}
@@ -106,7 +106,9 @@ class Export:
             return figure_bytes(histogram_figure(self._compare.samples, **shape), kind)
         shape |= {"gates": results.gates, "curve": results.species_curve()}
         alone = [(results.result.folder.stem, results.histogram)]
-        return figure_bytes(histogram_figure(alone, **shape), kind)
+        figure = histogram_figure(alone, **shape)
+        figure.axes[0].set_xlabel(results.sample.quantity.axis)
+        return figure_bytes(figure, kind)
 
     def _csv(self) -> bytes:
         """Write all events; those that were rejected say so."""
@@ -115,7 +117,12 @@ class Export:
         return bytes(marked.to_csv(index=False).encode())
 
     def _gates(self) -> bytes:
-        return bytes(pd.DataFrame(gate_rows(self._results.gates)).to_csv(index=False).encode())
+        """Write the gates; masses have their unit in the names of their columns."""
+        table, sample = pd.DataFrame(gate_rows(self._results.gates)), self._results.sample
+        if sample is not None and sample.quantity.unit == "kDa":
+            lengths = ("low", "high", "mean", "width")
+            table = table.rename(columns={name: f"{name}_kda" for name in lengths})
+        return bytes(table.to_csv(index=False).encode())
 
     def _toml(self) -> bytes:
         result = self._results.result
@@ -169,16 +176,7 @@ class Export:
             "kept = kept[~kept['event'].isin(rejected)]",
             f"ia.find_species(kept, {known}branch={branch!r}, start_kda={start!r}).species",
         ]
-        empty: dict[str, Any] = {
-            "cell_type": "code",
-            "execution_count": None,
-            "metadata": {},
-            "outputs": [],
-        }
-        cells = [empty | {"id": f"cell-{n}", "source": line} for n, line in enumerate(code)]
+        blank: Any = {"cell_type": "code", "execution_count": None, "metadata": {}, "outputs": []}
+        cells = [blank | {"id": f"cell-{n}", "source": line} for n, line in enumerate(code)]
         book = {"cells": cells, "metadata": {}, "nbformat": 4, "nbformat_minor": 5}
         return json.dumps(book, indent=1).encode()
-
-
-def _in_memory(make: Callable[[], bytes]) -> io.BytesIO:
-    return io.BytesIO(make())

@@ -106,7 +106,7 @@ class Files:
         drop = {"label": "Copy a small movie here", "multiple": True, "max_file_size": "200MB"}
         self._drop = pn.widgets.FileDropper(**drop, sizing_mode="stretch_width", height=90)
         self._notice.watch(self.refresh, self._filter)
-        self._where.param.watch(self._go, "value")
+        self._notice.watch(self._go, self._where)
         self._list.param.watch(self._pick, "value")
         self._drop.param.watch(self._dropped, "value")
         self.body = pn.FlexBox(
@@ -130,15 +130,13 @@ class Files:
             self._list.param.update(options=[*self._entries], value=here[:1])
             self._show()
 
-    def _go(self, event: Any) -> None:
-        folder = Path(event.new).expanduser()
-        if folder == self.folder:
-            return
-        if not folder.is_dir():
-            self._notice.say(f"{folder}: is no folder", "error")
-            return
-        self.folder = folder
-        self.refresh()
+    def _go(self) -> None:
+        folder = Path(self._where.value).expanduser()
+        if folder != self.folder:
+            if not folder.is_dir():
+                raise ia.DataError(f"{folder}: is no folder")
+            self.folder = folder
+            self.refresh()
 
     def _pick(self, event: Any) -> None:
         entry = self._entries.get(event.new[-1]) if event.new else None

@@ -9,20 +9,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import panel as pn
-from bokeh.models import (
-    BoxAnnotation,
-    BoxSelectTool,
-    CustomJS,
-    LinearAxis,
-    Range1d,
-    Spinner,
-    WheelZoomTool,
-)
+from bokeh import models
 
 import iscat_analysis as ia
 from iscat_analysis.pipeline.preview import RatioFilm
 from iscat_analysis.pipeline.stored import SHOWN_FRAMES
+from iscat_analysis.report.numbers import number
 from iscat_app.chosen import Chosen, Notice
+from iscat_app.results import sample_of
 from iscat_app.widgets import BLUE, ORANGE, RED, YELLOW, Picture, plot, source
 
 RATES = (5, 10, 25, 50, 100, 250, 1000)
@@ -43,7 +37,7 @@ class Film:
         self._film: RatioFilm | None = None
         self._shown: tuple[Any, ...] = ()
         self._preview: ia.Preview | None = None
-        self._events = pd.DataFrame()
+        self._events, self._unit = pd.DataFrame(), ""
         self._um = 1.0
         self._limits = (0.0, 1.0)
         self._begun = 0  # pictures that were sent before it was played
@@ -64,28 +58,32 @@ class Film:
         self._picture = Picture(_SIDE_PX, tools)
         shown = self._picture.figure
         shown.output_backend = "canvas"
-        shown.toolbar.active_scroll = shown.select_one({"type": WheelZoomTool})
+        shown.toolbar.active_scroll = shown.select_one({"type": models.WheelZoomTool})
         self._bar = source("x", "y", "text")
         shown.line("x", "y", source=self._bar, line_width=5, color=YELLOW)
         shown.text("x", "y", text="text", source=self._bar, text_color=YELLOW, y_offset=-6)
         # The browser says which picture it has drawn, and only then the next one is sent.
-        self._drawn = Spinner(value=0, visible=False, title="pictures drawn")
+        self._drawn = models.Spinner(value=0, visible=False, title="pictures drawn")
         answer = "requestAnimationFrame(() => { drawn.value = picture.data.sent[0] })"
         both = {"drawn": self._drawn, "picture": self._picture.data}
-        self._picture.data.js_on_change("data", CustomJS(args=both, code=answer))
+        self._picture.data.js_on_change("data", models.CustomJS(args=both, code=answer))
         self._drawn.on_change("value", self._browser_has_drawn)
 
         self._trace = source("frame", "light", "noise")
         self._light = plot((_SIDE_PX + 60, 170), ("frame", "light [counts]"), "reset")
-        self._light.update(toolbar_location=None, x_range=Range1d(0, 1), y_range=Range1d(0, 1))
-        self._light.line("frame", "light", source=self._trace, color=BLUE)
-        self._light.extra_y_ranges = {"noise": Range1d(0, 1)}
-        self._light.add_layout(LinearAxis(y_range_name="noise", axis_label="noise"), "right")
-        self._light.line("frame", "noise", source=self._trace, color=RED, y_range_name="noise")
+        self._light.update(toolbar_location=None, x_range=models.Range1d(0, 1))
+        self._light.extra_y_ranges = {"noise": models.DataRange1d(range_padding=0.15)}
+        self._light.add_layout(models.LinearAxis(y_range_name="noise", axis_label="noise"), "right")
+        light = self._light.line("frame", "light", source=self._trace, color=BLUE)
+        noise = {"source": self._trace, "color": RED, "y_range_name": "noise"}
+        self._light.extra_y_ranges["noise"].renderers = [
+            self._light.line("frame", "noise", **noise)
+        ]
+        self._light.y_range.update(renderers=[light], range_padding=0.15)
         marks = self._light.scatter("frame", "light", source=self._trace, size=3, alpha=0)
-        self._band = BoxAnnotation(left=0, right=0, fill_alpha=0.15, fill_color=ORANGE)
+        self._band = models.BoxAnnotation(left=0, right=0, fill_alpha=0.15, fill_color=ORANGE)
         self._light.add_layout(self._band)
-        self._light.add_tools(BoxSelectTool(dimensions="width", renderers=[marks]))
+        self._light.add_tools(models.BoxSelectTool(dimensions="width", renderers=[marks]))
 
     def _make_widgets(self) -> None:
         slider, integer = pn.widgets.IntSlider, pn.widgets.IntInput
@@ -101,22 +99,27 @@ class Film:
         self.events = pn.widgets.Checkbox(label="Ring the events of the result", value=True)
         self.first = integer(label="Marked frames, from", start=0, value=0, width=140)
         self.last = integer(label="to", start=0, value=0, width=140)
-        self.use_span = self._notice.button("Analyse only these frames", 300, self._keep_span)
-        self.leave_out = self._notice.button("Leave these frames out", 300, self._exclude)
-        self.use_span.disabled = self.leave_out.disabled = True
+        button = self._notice.button
+        self.of_span = [
+            button("Analyse only these frames", 300, lambda: self._keep("span", "frames")),
+            button(
+                "Leave these frames out", 300, lambda: self._keep("excluded", "excluded_frames")
+            ),
+        ]
         self.facts = pn.pane.HTML("", width=320)
         self.play.param.watch(self._play, "value")
         self.contrast.param.watch(self._contrast_changed, "value")
-        self._notice.watch(self._window_changed, self.window, what="value_throttled")
+        self._notice.watch(self._picture_changed, self.window, what="value_throttled")
         self._notice.watch(self._frame_moved, self.frame)
-        self._notice.watch(self._kind_changed, self.kind)
+        self._notice.watch(self._picture_changed, self.kind)
         self._notice.watch(self._search_changed, self.search)
         self._notice.watch(self._ring, self.events)
         self._notice.watch(self._show_span, self.first, self.last)
         self._trace.selected.on_change("indices", self._marked)
+        self._show_span()
         drawn, light = pn.pane.Bokeh(self._picture.figure), pn.pane.Bokeh(self._light)
         how = (self.kind, self.rate, self.window, self.contrast, self.events, self.search)
-        span = (pn.Row(self.first, self.last), self.use_span, self.leave_out)
+        span = (pn.Row(self.first, self.last), *self.of_span)
         self.body = pn.Column(
             self._notice.pane,
             pn.FlexBox(
@@ -176,7 +179,10 @@ class Film:
             )
         if self._chosen.result is not None:
             with self._notice.told(), ia.open_result(self._chosen.result) as result:
-                self._events = result.table
+                sample = sample_of(result, result.table)
+                values = sample.per_unit * np.abs(sample.quantity.values(result.table)[0])
+                texts = [number(value) for value in values]
+                self._events, self._unit = result.table.assign(text=texts), sample.quantity.unit
         self._um = (pixel_nm or 1000.0) / 1000.0
         frames, rows, columns = stack.shape
         unit = "µm" if pixel_nm else "pixels"
@@ -195,8 +201,6 @@ class Film:
         light = self._film.light()
         self._trace.data = {name: light[name].to_numpy() for name in light}
         self._light.x_range.update(start=0, end=frames)
-        self._light.y_range.update(**_around(light["light"]))
-        self._light.extra_y_ranges["noise"].update(**_around(light["noise"]))
 
     # ---- playing ----------------------------------------------------------------------------
 
@@ -257,14 +261,10 @@ class Film:
             if self.search.value:
                 self._look()
 
-    def _kind_changed(self) -> None:
+    def _picture_changed(self) -> None:
+        """Show pictures of another kind, or of another window."""
         if self._film is not None:
-            self._fit_limits()
-            self._show()
-
-    def _window_changed(self) -> None:
-        if self._film is not None:
-            self._film.window = self.window.value_throttled
+            self._film.window = self.window.value
             self._fit_limits()
             self._show()
             if self.search.value:
@@ -317,9 +317,9 @@ class Film:
             for row in near.to_dict("records"):
                 ok = row["status"] == "ok"
                 colour = ORANGE if not ok else _LANDS if row["mass_kda"] > 0 else _LEAVES
-                text = f"{row['mass_kda']:.0f}"
+                text = row["text"]
                 if row["event"] == self._chosen.event:
-                    colour, text = YELLOW, f"event {row['event']}: {text} kDa"
+                    colour, text = YELLOW, f"event {row['event']}: {text} {self._unit}".rstrip()
                 rings.append((row["x_px"], row["y_px"], colour, text))
         if self.search.value and self._found_at == at:
             for row in self._found.to_dict("records"):
@@ -385,24 +385,18 @@ class Film:
         """Shade the frames that are marked, unless these are all."""
         first, stop = self._span()
         some = first < stop and (first, stop) != (0, self.frame.end + 1)
-        self.use_span.disabled = self.leave_out.disabled = not some
+        for button in self.of_span:
+            button.disabled = not some
         self._band.update(left=first, right=stop if some else first)
 
     def _span(self) -> tuple[int, int]:
         first, last = self.first.value, self.last.value  # None where the field is empty
         return first or 0, (self.frame.end if last is None else last) + 1
 
-    def _exclude(self) -> None:
-        first, stop = self._chosen.excluded = self._span()
-        self._notice.say(
-            f"[{first}, {stop}] goes into fit.excluded_frames of the form: save it under Set up."
-        )
-
-    def _keep_span(self) -> None:
-        first, stop = self._chosen.span = self._span()
-        self._notice.say(
-            f"fit.frames = [{first}, {stop}] goes into the form: save it under Set up."
-        )
+    def _keep(self, name: str, key: str) -> None:
+        span = self._span()
+        self._chosen.param.update({name: span})
+        self._notice.say(f"{[*span]} goes into fit.{key} of the form: save it under Set up.")
 
 
 def _bar_of(width_um: float, height_um: float) -> dict[str, list[Any]]:
@@ -412,11 +406,3 @@ def _bar_of(width_um: float, height_um: float) -> dict[str, list[Any]]:
     length = max(step * power for step in (1, 2, 5) if step * power <= wanted)
     x, y = 0.04 * width_um, 0.96 * height_um
     return {"x": [x, x + length], "y": [y, y], "text": [f"{length:g} µm", ""]}
-
-
-def _around(values: pd.Series) -> dict[str, float]:
-    """Give an axis from a little below the values to a little above."""
-    seen = values[np.isfinite(values)]
-    low, high = (float(seen.min()), float(seen.max())) if len(seen) else (0.0, 1.0)
-    room = 0.15 * (high - low) or 0.05 * abs(high) or 1.0
-    return {"start": low - room, "end": high + room}

@@ -17,6 +17,7 @@ import pandas as pd
 import panel as pn
 
 import iscat_analysis as ia
+from iscat_analysis.config.files import model_of
 from iscat_analysis.movie import setup_beside
 from iscat_analysis.pipeline.setup import Setup, write_setup
 from iscat_app.chosen import Chosen, Notice
@@ -104,9 +105,8 @@ def fields() -> list[Field]:
     """List the keys of the configuration."""
     found = []
     for section, outer in ia.Config.model_fields.items():
-        kinds = (outer.annotation, *get_args(outer.annotation))  # a section may be absent
-        model = next(kind for kind in kinds if hasattr(kind, "model_fields"))
-        for name, field in model.model_fields.items() if section not in _ELSEWHERE else ():
+        known = {} if section in _ELSEWHERE else model_of(outer.annotation).model_fields
+        for name, field in known.items():
             about, default = field.description or "", field.get_default(call_default_factory=True)
             found.append(Field(f"{section}.{name}", about, default, _choices(field.annotation)))
     return found

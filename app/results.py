@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -10,26 +13,21 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import panel as pn
-from bokeh.events import SelectionGeometry
-from bokeh.models import BoxAnnotation, BoxSelectTool, PointDrawTool, TapTool
 
 import iscat_analysis as ia
-from iscat_analysis.answers.gates import (
-    Gate,
-    MassHistogram,
-    counted_events,
-    counted_rows,
-    gate,
-    gate_rows,
-    mass_histogram,
-    usual_bin,
-)
+from iscat_analysis.answers import gates
 from iscat_analysis.errors import DataError
 from iscat_analysis.files import whole_file
+from iscat_analysis.records import BoolArray
+from iscat_analysis.report.answer import DIAMETER, caution
+from iscat_analysis.report.movie_figures import Sample, bin_width, field, masses, time
+from iscat_analysis.report.numbers import number, with_error
+from iscat_analysis.report.vega import VegaFigure, figures_in
 from iscat_analysis.species.describe import Branch
+from iscat_analysis.species.diameters import describe_sizes
 from iscat_analysis.species.tables import EventTable
 from iscat_app import widgets as ui
-from iscat_app.chosen import Chosen, Notice, link_to, masses_in
+from iscat_app.chosen import Chosen, Notice, link_to, numbers_in
 
 COLUMNS = ("event", "frame", "x_px", "y_px", "mass_kda", "rejected_at")
 """Columns of the list: what the event was, so that a new analysis does not reject another."""
@@ -43,7 +41,7 @@ class Rejections:
         try:
             self.rows = pd.read_csv(self.path)
         except FileNotFoundError:
-            self.rows = pd.DataFrame(columns=list(COLUMNS))
+            self.rows = pd.DataFrame(columns=list(COLUMNS), dtype=float)
         except (OSError, ValueError) as error:
             raise DataError(f"{self.path}: cannot be read ({error}); move it away") from None
         if not set(COLUMNS) <= set(self.rows.columns):
@@ -51,15 +49,9 @@ class Rejections:
 
     def events(self, table: pd.DataFrame) -> set[int]:
         """Give the numbers of rejected events that are still those of the table."""
-        found = set()
-        known = table.set_index("event")
-        for row in self.rows.to_dict("records"):
-            if row["event"] in known.index:
-                now = known.loc[row["event"]]
-                near = abs(now["x_px"] - row["x_px"]) + abs(now["y_px"] - row["y_px"]) < 1.0
-                if near and now["frame"] == row["frame"]:
-                    found.add(int(row["event"]))
-        return found
+        both = table.merge(self.rows, on=["event", "frame"], suffixes=("", "_was"))
+        away = (both["x_px"] - both["x_px_was"]).abs() + (both["y_px"] - both["y_px_was"]).abs()
+        return set(both["event"][away < 1.0].astype(int))
 
     def lost(self, table: pd.DataFrame) -> int:
         """Count the rejected events that this table does not have."""
@@ -84,27 +76,47 @@ class Rejections:
             self.rows.to_csv(partial, index=False)
 
 
+def sample_of(
+    result: ia.StoredResult, rows: pd.DataFrame, described: Mapping[str, Any] | None = None
+) -> Sample:
+    """Take rows of a result as a sample, which knows what is measured and in which unit.
+
+    `described` replaces what the summary says of species and sizes.
+    """
+    summary = {**result.summary, **(described or {})}
+    ends = [math.ceil(place) + 1 for place in rows[["y_px", "x_px"]].max().fillna(0.0)]
+    field_of_view = np.zeros(summary["input"].get("shape", ends)[-2:])
+    kept: Any = {"table": rows, "tracks": None, "summary": summary, "ratio_image": field_of_view}
+    return Sample(replace(result.analysis, **kept))
+
+
+_NO_ROWS = pd.DataFrame(columns=["event", "frame"])
 _BRANCHES: dict[str, Branch] = {
     "landing and leaving": "magnitude",
     "landing": "landing",
     "leaving": "leaving",
 }
 _HINT = (
-    "<small>Drag over the histogram for a gate; click a bar, or dots below, to select events. The "
-    "point tool moves, adds (click) and removes (Backspace) the diamonds of species, and so do the "
-    "masses in the field. Species are of events that are ok.</small>"
+    "<small>Drag over the histogram for a gate; drag over dots, or click one, to select events. "
+    "Grey, or the only curve: the kernel density. Species are of events that are ok.</small>"
 )
 _GATES = (
-    "gate [kDa] | events | 95 % | mean [kDa] | ± SE | width [kDa] | fraction | 95 %",
-    "{low_kda:g} to {high_kda:g} | {count} | {count_low:.1f} to {count_high:.1f} | "
-    "{mean_kda:.2f} | {mean_se:.2f} | {width_kda:.2f} | {fraction:.1f%} | "
+    " | events | 95 % | mean | ± SE | width | fraction | 95 %",
+    "{low:g} to {high:g} | {count} | {count_low:.1f} to {count_high:.1f} | "
+    "{mean:.2f} | {mean_se:.2f} | {width:.2f} | {fraction:.1f%} | "
     "{fraction_low:.1f%} to {fraction_high:.1f%}",
 )
 _SPECIES = (
-    "species [kDa] | 95 % | width [kDa] | events | fraction | 95 %",
-    "{mass_kda:.1f} | {mass_low:.1f} to {mass_high:.1f} | {width_kda:.1f} | {count:.1f} |"
-    " {fraction:.1f%} | {fraction_low:.1f%} to {fraction_high:.1f%}",
+    " | σ | common | width | events | 95 % | share | 95 %",
+    "{value:.4g} | {sigma:.2g} | {systematic:.2g} | {width:.2g} | {count:.1f} | "
+    "{count_low:.1f} to {count_high:.1f} | {share:.1f%} | {share_low:.1f%} to {share_high:.1f%}",
 )
+_ENDS = {
+    "brush": {"low": "value"},
+    "stretch": {"time": "time", "value": "value"},
+    "area": {"x": "x", "y": "y"},
+}
+"""Columns of events by what somebody drags over, and by the axis of its figure."""
 
 
 class Results:
@@ -119,103 +131,69 @@ class Results:
         self.result: ia.StoredResult | None = None
         self.rejections: Rejections | None = None
         self.rejected: set[int] = set()
-        self.table = pd.DataFrame()
-        self.histogram: MassHistogram | None = None
-        self.gates: list[Gate] = []
-        self.species: ia.Distribution | None = None
-        self.start: list[float] | None = None  # from where the species were fitted
-        self._seen = pd.DataFrame()
-        self._make_figures()
+        self.table = _NO_ROWS
+        self.sample: Sample | None = None
+        self.histogram: gates.MassHistogram | None = None
+        self._ends: list[tuple[float, float]] = []  # of gates
+        self.start: list[float] | None = None  # [kDa], from where the species were fitted
+        self._described: dict[str, Any] = {}  # in place of what the summary says of species
+        self._behind: dict[str, Any] = {}  # the picture of the field, if the page has it
+        self._seen = _NO_ROWS
+        self._marked = np.zeros(0, dtype=bool)
+        self._marked_in = ""
+        picks = {"brush": (), "stretch": ("pick",), "area": ("pick",)}
+        self._drawn = {k: ui.Drawn((k, *more), self._dragged) for k, more in picks.items()}
         self._make_widgets()
 
-    # ---- figures ----------------------------------------------------------------------------
-
-    def _make_figures(self) -> None:
-        self._bars = ui.source("left", "right", "top")
-        self._curve, self._species_curve = ui.source("x", "y"), ui.source("x", "y")
-        self._handles = ui.source("x", "y")
-        self._events = ui.source("x", "y", "frame", "mass", "event", "colour")
-        self._hist = ui.plot((620, 330), ("|mass| [kDa]", "events"), "xwheel_zoom,xpan,reset,save")
-        grey = {
-            "alpha": 0.5,
-            "nonselection_alpha": 0.35,
-            "selection_color": ui.BLUE,
-            "color": ui.GREY,
-        }
-        edges = {"left": "left", "right": "right", "top": "top", "bottom": 0}
-        bars = self._hist.quad(**edges, source=self._bars, line_color="white", **grey)
-        self._hist.line("x", "y", source=self._curve, color=ui.BLUE, legend_label="kernel density")
-        red = {"color": ui.RED, "line_width": 2, "legend_label": "species"}
-        self._hist.line("x", "y", source=self._species_curve, **red)
-        diamond = {"marker": "diamond", "size": 14, "color": ui.RED, "nonselection_alpha": 1}
-        handles = self._hist.scatter("x", "y", source=self._handles, line_color="white", **diamond)
-        about = "move, add or remove species"
-        self._hist.add_tools(PointDrawTool(renderers=[handles], description=about))
-        legend = self._hist.legend[0]
-        legend.update(orientation="horizontal", border_line_color=None, padding=2)
-        self._hist.add_layout(legend, "above")
-        gate_tool = BoxSelectTool(dimensions="width", renderers=[], description="drag a gate")
-        self._hist.add_tools(gate_tool, TapTool(renderers=[bars]))
-        self._hist.toolbar.active_drag = gate_tool
-        self._hist.on_event(SelectionGeometry, self._dragged)
-        self._hist.y_range.start = 0
-        self._bars.selected.on_change("indices", self._bar_clicked)
-        tools = "pan,wheel_zoom,box_select,tap,reset"
-        self._map = ui.plot((310, 300), ("x [px]", "y [px]"), tools)
-        self._map.match_aspect = self._map.y_range.flipped = True
-        self._course = ui.plot((310, 300), ("frame", "mass [kDa]"), tools)
-        dot = {"size": 6, "selection_line_color": "black", "nonselection_alpha": 0.25}
-        for shown, x, y in ((self._map, "x", "y"), (self._course, "frame", "mass")):
-            shown.scatter(x, y, source=self._events, color="colour", **dot)
-        self._events.selected.on_change("indices", self._events_selected)
-
     def _make_widgets(self) -> None:
-        select = pn.widgets.Select
-        self.bin = ui.number("Bar width [kDa]", 10.0, 110, start=0.01)
-        self.kernel = ui.number("Kernel [kDa]", 10.0, 110, start=0.01)
+        select, button = pn.widgets.Select, self._notice.button
+        self.bin = ui.number("Bar width", 10.0, 130, start=1e-6)
+        self.kernel = ui.number("Kernel", 10.0, 110, start=1e-6)
         self.branch = select(label="Events", options=[*_BRANCHES], width=190)
         self.flagged = pn.widgets.Checkbox(label="flagged too")
-        self.find = self._notice.button("Find the species", 140, lambda: self._find_species(None))
-        again = "Fit again from the diamonds"
-        self.refit = self._notice.button(again, 210, lambda: self._find_species(self._means()))
-        begin = {"label": "Species begin at [kDa]", "placeholder": "66, 146", "width": 300}
-        self.begin = pn.widgets.TextInput(**begin)
-        self.low = ui.number("Gate from [kDa]", 0.0, 100)
-        self.high = ui.number("to [kDa]", 100.0, 100)
-        gates = (
-            self._notice.button("Add the gate", 100, lambda: self._add_gate(*self._ends())),
-            self._notice.button("Select its events", 120, lambda: self._select(*self._ends())),
-            self._notice.button("Remove all gates", 125, lambda: self._set_gates([])),
+        find = button("Find the species", 140, lambda: self._find_species(None))
+        again = button("Fit again from these", 160, lambda: self._find_species(self.means()))
+        self.begin = pn.widgets.TextInput(label="Species begin at", width=300)
+        self.low, self.high = ui.number("Gate from", 0.0, 110), ui.number("to", 100.0, 90)
+        of_gates = (
+            button("Add the gate", 95, self._add_gate),
+            button("Select its events", 115, self._select),
+            button("Remove all gates", 115, lambda: self._set_gates([])),
         )
         self._report = pn.pane.HTML("")
         self._gate_table, self._species_table = ui.wide_pane(), ui.wide_pane()
         self.which = select(label="Selected events", options=[], size=7, width=230)
-        self._facts = pn.pane.HTML("", width=300)
+        self._facts = pn.pane.HTML("", width=230)
         about = "data, model and residual of the event"
         self._picture = pn.pane.PNG(None, width=560, alt_text=about)
-        reject = self._notice.button("Reject the selected events", 190, self._reject)
+        reject = button("Reject the selected events", 190, self._reject)
         self.listed = select(label="Rejected by hand", options=[], size=5, width=230)
-        back = self._notice.button("Take the event back", 160, self._take_back)
+        back = button("Take the event back", 160, self._take_back)
         self._notice.watch(self._draw, self.bin, self.kernel, self.branch, self.flagged)
-        self._notice.watch(self._begin_typed, self.begin)
         self._notice.watch(self._show_event, self.which)
-        self._handles.on_change("data", self._write_means)
-        counted = (self.bin, self.kernel, self.branch, self.flagged, self.find, self._report)
+        counted = (self.bin, self.kernel, self.branch, self.flagged, find, self._report)
         self.body = pn.Column(
             self._notice.pane,
             ui.in_line(*counted),
             pn.FlexBox(
                 pn.Column(
-                    pn.pane.Bokeh(self._hist),
+                    self._drawn["brush"],
                     pn.pane.HTML(_HINT),
-                    ui.in_line(self.low, self.high, *gates),
-                    ui.in_line(self.begin, self.refit),
+                    ui.in_line(self.low, self.high, *of_gates),
+                    ui.in_line(self.begin, again),
                     self._gate_table,
                     self._species_table,
-                    pn.Row(pn.pane.Bokeh(self._map), pn.pane.Bokeh(self._course)),
-                    width=660,
+                    width=640,
                 ),
-                pn.Column(self.which, reject, self._facts, self._picture, self.listed, back),
+                pn.Column(
+                    self._drawn["stretch"],
+                    pn.FlexBox(
+                        self._drawn["area"],
+                        pn.Column(self.which, reject, self._facts, self.listed, back, width=240),
+                    ),
+                    self._picture,
+                    width=740,
+                ),
             ),
         )
 
@@ -229,179 +207,245 @@ class Results:
         self._shown = now
         if self.result is not None:
             self.result.close()
-        self.result, self.table = None, pd.DataFrame()
-        self.species, self.start = None, None
-        self._set_gates([])
+        self.result, self.sample, self.table, self._seen = None, None, _NO_ROWS, _NO_ROWS
+        self.rejected, self._ends = set(), []
+        self._report.object = ""
         if self._chosen.result is None:
             self._notice.say("There is no result yet: analyse the movie under Run.")
-            self._report.object = ""
+            self._show()
             return
         self._notice.say("")
         report = self._chosen.result / "report.html"
         self._report.object = link_to(report, "The whole report") if report.is_file() else ""
         with self._notice.told():
-            self.result = ia.open_result(self._chosen.result, movie=self._chosen.movie)
-            self.table = self.result.table
+            result = ia.open_result(self._chosen.result, movie=self._chosen.movie)
+            self.table, self._behind = result.table, _picture_in(report)
             self.rejections = Rejections(self._chosen.result)
             self.rejected = self.rejections.events(self.table)
-            lost = self.rejections.lost(self.table)
-            if lost:
+            if lost := self.rejections.lost(self.table):
                 self._notice.say(
                     f"{lost} events of {self.rejections.path.name} are not in this result"
                 )
-            if self.result.summary.get("interrupted"):
+            if result.summary.get("interrupted"):
                 self._notice.say("The analysis was interrupted: these are the events so far.")
-            width = usual_bin(self.table)
-            self.bin.value, self.kernel.value = width, width
-            self._draw()
+            self._seen = self._counted()
+            self._described, self.start = {}, None
+            if self.rejected:  # what the analysis says of species is of other events
+                self._described = dict.fromkeys(("distribution", "sizes"))
+            self._ask_in_units(sample_of(result, self._seen))
+            self.result = result
+            self._show()
 
-    def masses(self) -> np.ndarray[Any, Any]:
-        """Give the masses that count now."""
-        return np.abs(self._seen["mass_kda"].to_numpy(float)) if len(self._seen) else np.empty(0)
+    def _ask_in_units(self, sample: Sample) -> None:
+        """Ask for everything in the unit of the result."""
+        values, sigma = sample.values
+        known = np.isfinite(values)
+        width = bin_width(values[known], sigma[known]) if known.any() else 10.0
+        unit = f" [{sample.quantity.unit}]" if sample.quantity.unit else ""
+        self.low.label, self.high.label = f"Gate from{unit}", "to"
+        self.bin.param.update(label=f"Bar width{unit}", value=width)
+        self.kernel.param.update(label=f"Kernel{unit}", value=width)
+        self.high.value = 10 * width
+        self.begin.param.update(label=f"Species begin at{unit}", value="")
+
+    def _counted(self) -> pd.DataFrame:
+        """Give the rows that count now."""
+        how: Any = {"branch": self.counted_branch, "ok_only": not self.flagged.value}
+        counts = gates.counted_rows(self.table, rejected=self.rejected, **how)
+        return self.table[counts].reset_index(drop=True)
 
     def _draw(self) -> None:
         """Count anew: what is shown follows what counts."""
-        if not len(self.table):
+        if self.result is not None:
+            counted = self._counted()
+            if not counted.equals(self._seen):
+                self._seen, self.start, self.sample = counted, None, None
+                self._described = dict.fromkeys(("distribution", "sizes"))
+            self._show()
+
+    def _show(self) -> None:
+        """Show the events that count."""
+        self.histogram = None
+        if self.result is not None and len(self._seen):
+            self.sample = self.sample or sample_of(self.result, self._seen, self._described)
+            width = {"bar": self.bin.value, "kernel": self.kernel.value}
+            values = self.sample.values[0]
+            self.histogram = gates.mass_histogram(values[np.isfinite(values)], **width)
+        self._mark(np.zeros(len(self._seen), dtype=bool), "")
+        self._show_species()
+        rows = self.table[self.table["event"].isin(self.rejected)]
+        self.listed.options = {
+            f"{row['event']}, frame {row['frame']}": int(row["event"])
+            for row in rows.to_dict("records")
+        }
+
+    # ---- figures, and what is marked in them ------------------------------------------------
+
+    def _draw_figures(self) -> None:
+        """Draw all figures but that in which somebody has marked events."""
+        sample = self.sample
+        if sample is None:
+            for drawn in self._drawn.values():
+                drawn.draw(None)
             return
-        with self._notice.told():
-            counts = counted_rows(
-                self.table,
-                branch=self.counted_branch,
-                ok_only=not self.flagged.value,
-                rejected=self.rejected,
-            )
-            if not self.table[counts].equals(self._seen):
-                self._seen, self.species, self.start = self.table[counts], None, None
-            seen = self.histogram = mass_histogram(
-                self.masses(), bin_kda=self.bin.value, bandwidth_kda=self.kernel.value
-            )
-            self._bars.selected.indices = []
-            self._bars.data = {"left": seen.edges[:-1], "right": seen.edges[1:], "top": seen.counts}
-            self._curve.data = {"x": seen.mass_kda, "y": seen.density}
-            self._hist.yaxis.axis_label = f"events per {seen.bin_kda:g} kDa"
-            self._draw_species()
-            place = {"x": "x_px", "y": "y_px", "frame": "frame", "mass": "mass_kda"}
-            place["event"] = "event"
-            data = {name: self._seen[column].to_numpy() for name, column in place.items()}
-            data["colour"] = np.where(self._seen["status"] == "ok", ui.BLUE, ui.ORANGE)
-            self._events.selected.indices = []
-            self._events.data = data
-            self._set_gates([(g.low_kda, g.high_kda) for g in self.gates])
-            self._list_rejected()
+        marked = self._marked | (not self._marked.any())
+        sample.events.update(row=list(range(len(marked))), marked=marked.tolist())
+        made: dict[str, Callable[[], VegaFigure]] = {
+            "brush": lambda: masses(sample, self.bin.value, self._beside(sample)),
+            "stretch": lambda: time(sample),
+            "area": lambda: field(sample),
+        }
+        for name, make in made.items():
+            if name != self._marked_in:
+                figure = make()
+                data = {**figure.data, **(self._behind if name == "area" else {})}
+                self._drawn[name].draw(replace(figure, data=data))
+
+    def _beside(self, sample: Sample) -> dict[str, pd.DataFrame]:
+        """Give what the histogram shows beside bars and species."""
+        seen, wide = self.histogram, self.bin.value
+        k, many = np.unique(sample.values[0][self._marked] // wide, return_counts=True)
+        bars = {"low": k * wide, "high": (k + 1) * wide, "bottom": 0, "top": many, "count": many}
+        labels = [f"{number(each.mean)}: {each.count}" for each in self.gates]
+        more = {
+            "gates": pd.DataFrame(gates.gate_rows(self.gates)).assign(label=labels),
+            "bars": pd.DataFrame(bars | {"part": "marked"}),
+        }
+        if seen is not None:
+            smooth = {"species": -1, "value": seen.at, "density": seen.density / seen.bar}
+            more["curves"] = pd.DataFrame(smooth)
+        return more
+
+    def _dragged(self, name: str, ends: Any) -> None:
+        """Mark the events over which somebody has dragged, or the one that was clicked."""
+        if self.sample is None or (not ends and name != self._marked_in):
+            return
+        inside = np.full(len(self._seen), bool(ends) and name in _ENDS)
+        if name not in _ENDS:
+            inside[[each["row"] for each in ends]] = True
+        for axis, (low, high) in ends.items() if name in _ENDS else ():
+            column = _ENDS[name][axis.replace("\\", "")]
+            value = np.asarray(self.sample.events[column], float)
+            inside &= (value >= min(low, high)) & (value <= max(low, high))
+            if name == "brush":
+                digits = 2 - math.floor(math.log10(self.bin.value))
+                self.low.value, self.high.value = round(low, digits), round(high, digits)
+        self._mark(inside, name)
+
+    def _select(self) -> None:
+        """Mark the events between the ends of the gate."""
+        if self.sample is not None:
+            (low, high), values = self._typed(), self.sample.values[0]
+            self._mark((values >= low) & (values < high), "")
+
+    def _mark(self, inside: BoolArray, name: str) -> None:
+        self._marked, self._marked_in = inside, name
+        self._set_gates(self._ends)
+        options: dict[str, int] = {}
+        if self.sample is not None:
+            named = zip(self._seen["event"], *self.sample.values, self._seen["status"], strict=True)
+            for event, value, sigma, status in np.array([*named], dtype=object)[inside]:
+                told = f"{event}: {with_error(value, sigma)} {self.sample.quantity.unit}".rstrip()
+                options[f"{told}, {status}"] = int(event)
+        self.which.param.update(options=options, value=next(iter(options.values()), None))
 
     # ---- gates ------------------------------------------------------------------------------
 
-    def _dragged(self, event: SelectionGeometry) -> None:
-        if event.final and event.geometry.get("type") == "rect":
-            self._add_gate(event.geometry["x0"], event.geometry["x1"])
+    @property
+    def gates(self) -> list[gates.Gate]:
+        """What is inside the gates."""
+        if self.sample is None:
+            return []
+        return [gates.gate(self.sample.values[0], *ends) for ends in self._ends]
 
-    def _ends(self) -> tuple[float, float]:
-        return self.low.value or 0.0, self.high.value or 0.0  # None where the field is empty
+    def _typed(self) -> tuple[float, float]:
+        low, high = sorted((self.low.value or 0.0, self.high.value or 0.0))  # None where empty
+        return low, high
 
-    def _add_gate(self, low: float, high: float) -> None:
-        low, high = sorted((max(round(low, 1), 0.0), round(high, 1)))
+    def _add_gate(self) -> None:
+        low, high = self._typed()
         if high > low:
-            self._set_gates([*((g.low_kda, g.high_kda) for g in self.gates), (low, high)])
+            self._marked_in = ""
+            self._set_gates([*self._ends, (low, high)])
 
     def _set_gates(self, ends: list[tuple[float, float]]) -> None:
-        with self._notice.told():
-            self.gates = [gate(self.masses(), low, high) for low, high in sorted(ends)]
-        kept = [r for r in self._hist.center if not isinstance(r, BoxAnnotation)]
-        look = {"fill_alpha": 0.12, "fill_color": ui.BLUE}
-        ends_of = [(each.low_kda, each.high_kda) for each in self.gates]
-        boxes = [BoxAnnotation(left=low, right=high, **look) for low, high in ends_of]
-        self._hist.center = [*kept, *boxes]
-        self._gate_table.object = ui.listing(gate_rows(self.gates), *_GATES) if self.gates else ""
+        self._ends = sorted(ends)
+        self._draw_figures()
+        rows, axis = (
+            gates.gate_rows(self.gates),
+            "" if self.sample is None else self.sample.quantity.axis,
+        )
+        self._gate_table.object = ui.listing(rows, axis + _GATES[0], _GATES[1]) if rows else ""
 
     # ---- species ----------------------------------------------------------------------------
 
-    def _means(self) -> list[float]:
-        """Give the masses at which somebody left the diamonds."""
-        return sorted({round(float(x), 2) for x in self._handles.data["x"] if x > 0})
-
-    def _write_means(self, _attr: str, _old: Any, _new: Any) -> None:
-        self.begin.value = ", ".join(f"{mass:g}" for mass in self._means())
-
-    def _begin_typed(self) -> None:
-        """Put the diamonds where somebody writes."""
-        masses = sorted(masses_in(self.begin.value))
-        if masses != self._means():
-            curve = self.species_curve()
-            height = np.interp(masses, *curve) if curve else np.zeros(len(masses))
-            self._handles.data = {"x": np.array(masses), "y": height}
+    def means(self) -> list[float]:
+        """Give the masses [kDa] at which species are to begin."""
+        values = np.array(sorted(numbers_in(self.begin.value)))
+        if self.sample is None:
+            return []
+        power = max(self.sample.quantity.power, 1)
+        return list((values / self.sample.scale) ** (1 / power))
 
     def events(self) -> EventTable:
         """Give the events that count, with what the search of the whole result missed."""
         if self.result is None:
-            raise ia.DataError("there is no result yet")
-        return counted_events(self.result.folder, self._seen)
+            raise DataError("there is no result yet")
+        return gates.counted_events(self.result.folder, self._seen)
 
     @property
     def counted_branch(self) -> Branch:
         """Which side of zero counts."""
         return _BRANCHES[self.branch.value]
 
-    def _find_species(self, start: list[float] | None) -> None:
-        """Fit species, as many as there are, or from where somebody says."""
-        seen, branch = self._seen, self.counted_branch
-        if start is not None and not start:
-            self._notice.say("Find the species first, or give masses to begin at.")
-        elif len(seen):
-            events = self.events()
-            self._notice.work(
-                "Finding species",
-                lambda: ia.find_species(events, start_kda=start, branch=branch),
-                lambda found: self._take_species(found, seen, start),
-            )
-
-    def _take_species(
-        self, found: ia.Distribution, seen: pd.DataFrame, start: list[float] | None
-    ) -> None:
-        if seen is self._seen:  # and not of events that count no more
-            self.species, self.start = found, start
-            self._draw_species()
-
     def species_curve(self) -> tuple[Any, Any] | None:
         """Give the curve of the species, per bar of the histogram."""
-        if self.species is None or self.histogram is None:
+        curves = {} if self.sample is None else masses(self.sample).data.get("curves", {})
+        if not curves or self.histogram is None:
             return None
-        curves = self.species.curves
-        return curves["mass_kda"].to_numpy(), curves["model"].to_numpy() * self.histogram.bin_kda
+        whole = pd.DataFrame(curves).groupby("value")["density"].sum() * self.histogram.bar
+        return whole.index, whole
 
-    def _draw_species(self) -> None:
-        found = self.species_curve()
-        if found is None or self.species is None:
-            self._species_curve.data = self._handles.data = {"x": [], "y": []}
+    def _find_species(self, start: list[float] | None) -> None:
+        """Fit species, as many as there are, or from where somebody says."""
+        seen, sample = self._seen, self.sample
+        if start is not None and not start:
+            self._notice.say("Find the species first, or give values to begin at.")
+        elif sample is not None and not sample.analysis.mode_kind.masses_free:
+            raise DataError("Masses were not fitted in this movie, so it has no species.")
+        elif sample is not None:
+            events, branch = self.events(), self.counted_branch
+
+            def find() -> dict[str, Any]:
+                if sample.quantity is DIAMETER:
+                    sizes = describe_sizes(*sample.values, seed=0, common=0.0, findings=[])
+                    return {"sizes": None if sizes is None else sizes.to_dict()}
+                found = ia.find_species(events, start_kda=start, branch=branch)
+                return {"distribution": found.to_dict()}
+
+            self._notice.work("Finding species", find, lambda found: self._take(found, seen, start))
+
+    def _take(self, found: dict[str, Any], seen: pd.DataFrame, start: list[float] | None) -> None:
+        if seen is self._seen:  # and not of events that count no more
+            self._described, self.start, self.sample = found, start, None
+            self._show()
+
+    def _show_species(self) -> None:
+        sample = self.sample
+        found = [] if sample is None else sample.species
+        if sample is None or not found:
             self._species_table.object = ""
+            if sample is not None and (wrong := caution(sample.fits)) is not None:
+                self._notice.say(wrong.text)
             return
-        self._species_curve.data = {"x": found[0], "y": found[1]}
-        means = self.species.species["mass_kda"].dropna().to_numpy(float)
-        self._handles.data = {"x": means, "y": np.interp(means, *found)}
-        rows = ui.listing(self.species.species.to_dict("records"), *_SPECIES)
-        self._species_table.object = rows + ui.lines(f"{note}." for note in self.species.notes)
+        self.begin.value = ", ".join(f"{each.value:.4g}" for each in found)
+        notes = (sample.described("sizes") or sample.described("distribution") or {})["notes"]
+        if sample.quantity.unit != "kDa":  # of masses that have no scale
+            notes = [note for note in notes if "kDa" not in note]
+        table = ui.listing(map(vars, found), sample.quantity.axis + _SPECIES[0], _SPECIES[1])
+        self._species_table.object = table + ui.lines(f"{note}." for note in notes)
 
     # ---- single events ----------------------------------------------------------------------
-
-    def _bar_clicked(self, _attr: str, _old: Any, new: list[int]) -> None:
-        if self.histogram is None or not new:
-            return
-        edges, mass = self.histogram.edges, self.masses()
-        inside = np.zeros(mass.size, dtype=bool)
-        for bar in (b for b in new if b < self.histogram.counts.size):
-            inside |= (mass >= edges[bar]) & (mass < edges[bar + 1])
-        self._events.selected.indices = np.flatnonzero(inside).tolist()
-
-    def _select(self, low: float, high: float) -> None:
-        """Select the events between two masses, as a click on their bars would."""
-        mass = self.masses()
-        self._events.selected.indices = np.flatnonzero((mass >= low) & (mass < high)).tolist()
-
-    def _events_selected(self, _attr: str, _old: Any, new: list[int]) -> None:
-        options = {
-            f"{row['event']}: {row['mass_kda']:.1f} kDa, {row['status']}": int(row["event"])
-            for row in self._seen.iloc[new].to_dict("records")
-        }
-        self.which.param.update(options=options, value=next(iter(options.values()), None))
 
     def _show_event(self) -> None:
         """Show the numbers of an event, and then its pictures, which are made of the movie."""
@@ -413,19 +457,17 @@ class Results:
         self._facts.object = ui.table_of(result.facts(row))
         # where the film goes, and what it rings
         self._chosen.param.update(frame=int(self.table["frame"].iloc[row]), event=int(event))
-        self._notice.work(
-            "Drawing the event", lambda: _png(result, row), lambda png: self._take(png, event)
-        )
 
-    def _take(self, picture: bytes, event: int) -> None:
-        if self.which.value == event:
-            self._picture.object = picture
+        def take(picture: bytes) -> None:
+            if self.which.value == event:
+                self._picture.object = picture
+
+        self._notice.work("Drawing the event", lambda: _png(result, row), take)
 
     def _reject(self) -> None:
-        chosen = self._events.selected.indices
-        if not chosen or self.rejections is None:
-            raise DataError("Select events first: click a bar, or a dot.")
-        self.rejections.reject(self._seen.iloc[chosen])
+        if not self._marked.any() or self.rejections is None:
+            raise DataError("Select events first: drag over the figures, or click a dot.")
+        self.rejections.reject(self._seen[self._marked])
         self._rejected_anew()
 
     def _take_back(self) -> None:
@@ -439,11 +481,13 @@ class Results:
             self._draw()
             self._notice.say(f"{len(self.rejected)} rejected by hand: {self.rejections.path.name}")
 
-    def _list_rejected(self) -> None:
-        rows = self.table[self.table["event"].isin(self.rejected)].to_dict("records")
-        self.listed.options = {
-            f"{r['event']}: {r['mass_kda']:.1f} kDa": int(r["event"]) for r in rows
-        }
+
+def _picture_in(page: Path) -> dict[str, Any]:
+    """Give the picture of the field as the page of a result has it."""
+    try:
+        return {"picture": figures_in(page)["field"].data["picture"]}
+    except (DataError, KeyError):
+        return {}
 
 
 def _png(result: ia.StoredResult, row: int) -> bytes:

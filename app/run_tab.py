@@ -28,11 +28,14 @@ class RunTab:
         self._overwrite = pn.widgets.Checkbox(label="Replace an earlier result")
         where = "Where: threads, or the address of a Dask scheduler"
         self._scheduler = pn.widgets.TextInput(label=where, value="threads", width=330)
-        start = self._notice.button("Analyse this movie", 170, self._start, main=True)
-        every = self._notice.button("Analyse all movies of the folder", 240, self._start_all)
+        button = self._notice.button
+        start = button("Analyse this movie", 170, self._start, main=True)
+        every = button("Analyse all movies of the folder", 240, self._start_all)
         self._which = pn.widgets.Select(label="Run", options=[], width=420)
-        stop = self._notice.button("Stop", 90, lambda: self._do(self._queue.stop))
-        again = self._notice.button("Go on or try again", 160, lambda: self._do(self._queue.again))
+        stop = button("Stop", 90, lambda: self._do(self._queue.stop))
+        again = button(
+            "Go on or try again", 160, lambda: self._do(lambda r: self._queue.add(r.job))
+        )
         self._notice.watch(self._show, self._which)
         self._bar = pn.indicators.Progress(value=0, max=100, width=420)
         self._state = pn.pane.HTML("")

@@ -116,7 +116,7 @@ class Queue:
             return run
 
     def stop(self, run: Run) -> None:
-        """Stop a run; what it has finished is kept, and `again` goes on from there."""
+        """Stop a run; what it has finished is kept, and the same job goes on from there."""
         with self._wake:
             if run.state == "waiting":
                 run.state = "stopped"
@@ -124,10 +124,6 @@ class Queue:
                 run.state, run.is_asked_to_stop = "stopping", True
                 os.kill(self._process.pid, signal.SIGINT)
             self.version += 1
-
-    def again(self, run: Run) -> Run:
-        """Go on with a run that was stopped, or repeat one that failed."""
-        return self.add(run.job)
 
     def close(self) -> None:
         """Stop what runs and begin nothing more."""

@@ -11,8 +11,10 @@ import secrets
 import socket
 import threading
 import traceback
+import warnings
 import webbrowser
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar
 from urllib.parse import urlencode
@@ -36,6 +38,7 @@ from iscat_app.form import Form
 from iscat_app.results import Results
 from iscat_app.run_tab import RunTab
 from iscat_app.runs import Queue
+from iscat_app.widgets import given
 
 STYLE = """
 .notice { padding: 6px 10px; border-left: 4px solid #0072B2; }
@@ -61,7 +64,7 @@ document.addEventListener("keydown", (event) => {
 </script>"""
 """Bokeh's tabs can be reached with the keyboard, but answer to clicks alone."""
 
-pn.extension(notifications=False, raw_css=[STYLE], sizing_mode=None, throttled=False)
+pn.extension("vega", notifications=False, raw_css=[STYLE], sizing_mode=None, throttled=False)
 
 
 class _Template(pn.template.VanillaTemplate):
@@ -73,11 +76,9 @@ class _Template(pn.template.VanillaTemplate):
 def page_of(folder: Path, queue: Queue) -> Any:
     """Make the page of one browser tab; each has its own."""
     chosen = Chosen()
-    given = _given("movie")
-    if given:
-        chosen.choose(Path(given))
+    if movie := given("movie"):
+        chosen.choose(Path(movie))
     start = folder if chosen.movie is None else chosen.movie.parent
-    dark = _given("theme") == "dark"
     results, runs, compare = Results(chosen), RunTab(chosen, queue), Compare(chosen, queue)
     first: list[Part] = [Files(chosen, start), Film(chosen), Form(chosen), runs, results, compare]
     last: list[Part] = [Calibrate(chosen, queue), Bounds(chosen), Export(chosen, results, compare)]
@@ -92,7 +93,9 @@ def page_of(folder: Path, queue: Queue) -> Any:
     )
 
     def show(*_: Any) -> None:
-        heading.object = f"<h2>{html.escape(_name_of(chosen))}</h2>"
+        named = chosen.movie or chosen.result
+        name = "Choose a movie" if named is None else named.name
+        heading.object = f"<h2>{html.escape(name)}</h2>"
         colours.object = _colours(chosen)
         part, place = parts[tabs.active], places[tabs.active]
         if not len(place):
@@ -101,9 +104,7 @@ def page_of(folder: Path, queue: Queue) -> Any:
 
     def remember(*_: Any) -> None:
         if pn.state.location is not None:
-            pn.state.location.update_query(
-                movie=None if chosen.movie is None else str(chosen.movie)
-            )
+            pn.state.location.update_query(movie=chosen.movie and str(chosen.movie))
 
     colours = pn.pane.HTML("")
     heading = pn.pane.HTML("", sizing_mode="stretch_width")
@@ -115,18 +116,12 @@ def page_of(folder: Path, queue: Queue) -> Any:
         main=[heading, tabs],
         header=[colours, pn.pane.HTML(_KEYS)],
         header_background="#1B1D21",
-        theme="dark" if dark else "default",
+        theme="dark" if given("theme") == "dark" else "default",
         busy_indicator=None,
     )
     show()
     runs.watch()
     return template
-
-
-def _given(name: str) -> str:
-    """Read a part of the address."""
-    values = pn.state.session_args.get(name) or [b""]
-    return str(values[0], "utf-8", "replace")
 
 
 def _colours(chosen: Chosen) -> str:
@@ -137,11 +132,6 @@ def _colours(chosen: Chosen) -> str:
         query = html.escape(urlencode(same | {"theme": theme}))
         links.append(f'<a style="color: white" href="?{query}">{name}</a>')
     return f'<nav aria-label="colours">{" · ".join(links)}</nav>'
-
-
-def _name_of(chosen: Chosen) -> str:
-    named = chosen.movie or chosen.result
-    return "Choose a movie" if named is None else named.name
 
 
 HOST = "127.0.0.1"
@@ -197,6 +187,8 @@ def serve(
     )
     address = f"http://{HOST}:{number}/?token={token}"
 
+    # What the browser says first of a figure that was added to the page names it in full.
+    warnings.filterwarnings("ignore", "reference already known")
     server.start()
     say(address)
     threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
@@ -286,11 +278,8 @@ def _free_port(wanted: int | None) -> int:
     """Find a port that nothing listens at, or make sure of the one that is asked for."""
     ports = range(FIRST_PORT, FIRST_PORT + PORTS) if wanted is None else [wanted]
     for port in ports:
-        with socket.socket() as probe:
-            try:
-                probe.bind((HOST, port))
-            except (OSError, OverflowError):
-                continue
+        with socket.socket() as probe, suppress(OSError, OverflowError):
+            probe.bind((HOST, port))
             return int(probe.getsockname()[1])
     if wanted is not None:
         raise ConfigError(f"--port {wanted}: is in use, or not allowed; leave it out")

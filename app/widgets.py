@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from html import escape
 from typing import Any
 
@@ -12,6 +13,7 @@ from bokeh.models import ColumnDataSource, Range1d
 from bokeh.plotting import figure
 
 from iscat_analysis.records import FloatArray
+from iscat_analysis.report.vega import VegaFigure, configuration, records
 from iscat_analysis.units import cells
 
 BLUE, RED, GREY, ORANGE, YELLOW = "#0072B2", "#D55E00", "#8A8F96", "#E69F00", "#F0E442"
@@ -44,6 +46,62 @@ def plot(size_px: tuple[int, int], axes: tuple[str, str], tools: str = "") -> An
     made = figure(width=width, height=height, x_axis_label=x, y_axis_label=y, tools=tools)
     made.toolbar.logo = None
     return made
+
+
+def given(name: str) -> str:
+    """Read a part of the page's address."""
+    values = pn.state.session_args.get(name) or [b""]
+    return str(values[0], "utf-8", "replace")
+
+
+def clickable(figure: VegaFigure, field: str) -> VegaFigure:
+    """Let somebody click the points of a figure, which says the value of their field."""
+    pick = {"name": "pick", "select": {"type": "point", "fields": [field], "nearest": True}}
+    layers = [
+        {**one, "params": [pick]} if one.get("name") == "point" else one
+        for one in figure.specification["layer"]
+    ]
+    return replace(figure, specification={**figure.specification, "layer": layers})
+
+
+class Drawn(pn.pane.Vega):
+    """A figure of one of the specifications, and what somebody drags over it or clicks in it.
+
+    `names` are the selections of its specification.  Panel would ask the browser for them before
+    the figure is drawn, cannot clear that of a click, and keeps the rows of the figure before.
+    """
+
+    def __init__(self, names: Sequence[str] = (), dragged: Callable[[str, Any], None] = print):
+        self._names, self._dragged = names, dragged
+        theme = "dark" if given("theme") == "dark" else None
+        super().__init__(None, debounce=150, visible=False, theme=theme)
+
+    def draw(self, figure: VegaFigure | None) -> None:
+        """Show a figure; nothing where there is none."""
+        self.visible = figure is not None
+        if figure is None:
+            return
+        sets = {name: records(columns) for name, columns in figure.data.items()}
+        fast = max(map(len, sets.values()), default=0) > 1500
+        how = {"embedOptions": {"renderer": "canvas" if fast else "svg"}}
+        config = configuration()
+        if self.theme:  # which has its own colours of letters and lines
+            config = {k: config[k] for k in ("background", "font", "view", "axisX")}
+            config["text"] = {"color": "#ccc"}
+        whole = {**figure.specification, "config": config, "usermeta": how}
+        if whole.get("width") == "container":
+            whole["width"] = 580
+        self.object = {**whole, "datasets": sets}
+
+    @property
+    def _selections(self) -> dict[str, str]:
+        return dict.fromkeys(self._names, "interval")
+
+    def _get_sources(self, *_: Any) -> dict[str, Any]:
+        return {}
+
+    def _process_event(self, event: Any) -> None:
+        self._dragged(event.data["type"], event.data["value"])
 
 
 class Picture:

@@ -111,29 +111,50 @@ class Page:
         field.clear()
         field.send_keys(text, Keys.TAB)
 
-    def click_figure(self, x_label: str, x: float) -> None:
-        """Click a figure at a place of its horizontal axis, in the middle of its height."""
-        across, down = self.until(
-            f"{x_label} has a frame",
-            lambda: self.bokeh(
+    def place_in(self, title: str, across: float, *, in_units: bool = False) -> tuple[float, float]:
+        """Find a place in the middle of a figure that has an axis of this title.
+
+        `across` is a share of its width, or a value on that axis.
+        """
+        found = self.until(
+            f"{title} is drawn",
+            lambda: self.script(
                 """
-                const plot = models.find(
-                  (m) => m.type === "Figure" && m.below?.[0]?.axis_label === arguments[0]);
-                const view = plot && Bokeh.index.find_one(plot);
-                if (!view?.el || !shown(view.el)) return null;
-                view.el.scrollIntoView({ block: "center" });
-                const box = view.el.getBoundingClientRect(), frame = view.frame.bbox;
-                return [box.x + view.frame.x_scale.compute(arguments[1]),
-                        box.y + (frame.top + frame.bottom) / 2];
+                for (const svg of everywhere(document).filter((n) => n.matches("svg.marks"))) {
+                  const titles = [...svg.querySelectorAll(".role-axis-title text")];
+                  const title = titles.find((n) => n.textContent === arguments[0]);
+                  if (!title || !shown(svg)) continue;
+                  svg.scrollIntoView({ block: "center" });
+                  const box = svg.querySelector(".role-frame .background").getBoundingClientRect();
+                  const labels = title.closest(".role-axis").querySelectorAll(
+                    ".role-axis-label text");
+                  const ticks = [...labels].map((n) => {
+                    const place = n.getBoundingClientRect();
+                    return [parseFloat(n.textContent), place.x + place.width / 2];
+                  });
+                  return [[box.x, box.y, box.width, box.height], ticks[0], ticks.at(-1)];
+                }
                 """,
-                x_label,
-                x,
+                title,
             ),
         )
+        (x, y, width, height), (low, left), (high, right) = found
+        share = (across - low) / (high - low) if in_units else across
+        at = left + share * (right - left) if in_units else x + share * width
+        return at, y + height / 2
+
+    def drag(self, title: str, start: float, stop: float, *, in_units: bool = False) -> None:
+        """Drag over a figure from one place to another; to the same it is a click."""
         from selenium.webdriver.common.actions.action_builder import ActionBuilder
 
+        self.place_in(title, start, in_units=in_units)  # where it is scrolled to
         mouse = ActionBuilder(self.driver)
-        mouse.pointer_action.move_to_location(round(across), round(down)).click()
+        for number, share in enumerate((0.0, 0.3, 0.7, 1.0)):
+            at, down = self.place_in(title, start + share * (stop - start), in_units=in_units)
+            mouse.pointer_action.move_to_location(round(at), round(down))
+            if number == 0:
+                mouse.pointer_action.pointer_down()
+        mouse.pointer_action.pointer_up()
         mouse.perform()
 
     def bokeh(self, code: str, *given: Any) -> Any:

@@ -26,13 +26,23 @@ def result_of(folder: Path, masses: NDArray[np.float64], sigma_kda: float) -> Pa
         "mass_kda": masses, "sigma_mass_kda": sigma_kda, "contrast": GRADIENT * masses,
         "status": "ok", "snr": masses / sigma_kda,
     }  # fmt: skip
-    table = pd.DataFrame({name: told.get(name, np.nan) for name in ia.EVENT_COLUMNS} | told)
+    table = pd.DataFrame(dict.fromkeys(ia.EVENT_COLUMNS, 0.0) | told)
     folder.mkdir()
     table.to_csv(folder / "fits.csv", index=False)
     table.to_parquet(folder / "fits.parquet")
-    summary = {"events": masses.size, "mode": "mass", "input": {"path": "gone.tif", "sha256": ""}}
+    summary = {"events": masses.size, "mode": "mass", "mass_scale": "calibration"}
+    summary |= {"input": {"path": "gone.tif", "sha256": ""}}
+    summary |= {"versions": {}, "seed": None, "findings": []}
     (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
     (folder / "config.toml").write_text(ia.config_to_toml(ia.configure()), encoding="utf-8")
+    return folder
+
+
+def uncalibrated(folder: Path) -> Path:
+    """Say of a result that its masses have no scale."""
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    text = json.dumps(summary | {"mass_scale": "absolute model"})
+    (folder / "summary.json").write_text(text, encoding="utf-8")
     return folder
 
 

@@ -143,7 +143,9 @@ class MovieResult:
         list of (str, str)
             What is told, and its value with error, bound and unit.
         """
-        return event_facts(self.table.iloc[row])
+        facts = event_facts(self.table.iloc[row])
+        unscaled = answer.is_uncalibrated(self.analysis)
+        return [fact for fact in facts if not (unscaled and fact[0] == LABELS["mass_kda"])]
 
     # ---- Figures -----------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from itertools import pairwise
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -384,11 +385,15 @@ def bin_width(values: FloatArray, sigma: FloatArray) -> float:
     return power * min(_NICE, key=lambda nice: abs(math.log(nice * power / wide)))
 
 
-def masses(sample: Sample) -> VegaFigure:
-    """Show the histogram of the main quantity, and the species."""
+def masses(
+    sample: Sample,
+    wide: float | None = None,
+    more: Mapping[str, pd.DataFrame] = MappingProxyType({}),
+) -> VegaFigure:
+    """Show the histogram of the main quantity, the species, and more rows of its data sets."""
     values, sigma = sample.values
     kept = np.isfinite(values)
-    wide = bin_width(values[kept], sigma[kept & sample.is_ok])
+    wide = wide or bin_width(values[kept], sigma[kept & sample.is_ok])
     bars = _bars(values[kept], sample.is_ok[kept], wide)
     curves = _curves(sample)
     unit = f" {sample.quantity.unit}".rstrip()
@@ -412,8 +417,11 @@ def masses(sample: Sample) -> VegaFigure:
         "bin": wide,
         "span": _around(bars["low"].min(), bars["high"].max(), wide),
     }
-    data = {name: columns_of(v) for name, v in (("bars", bars), ("curves", curves))}
-    data["peaks"] = columns_of(peaks)
+    parts = {"bars": bars, "curves": curves, "peaks": peaks, "gates": ()}
+    data = {name: columns_of(part) for name, part in parts.items()}
+    for name, rows in more.items():
+        for key, column in columns_of(rows).items():
+            data[name] = {**data[name], key: [*data[name].get(key, ()), *column]}
     drawn = figure("masses", data, {**sample.words, **words})
     return described(drawn, _sentence(sample))
 

@@ -170,19 +170,19 @@ def histogram_figure(
             style: Style = {"color": colour if shares else GREY, "alpha": 0.9 if shares else 0.45}
             axes.stairs(mass.counts * scale, mass.edges, fill=not shares, label=name, **style)
             if density:
-                axes.plot(mass.mass_kda, mass.density * scale, color=colour, lw=1.2)
+                axes.plot(mass.at, mass.density * scale, color=colour, lw=1.2)
         if curve is not None:
             axes.plot(*map(np.asarray, curve), color=VERMILLION, lw=1.6, label="species")
         for each in gates:
-            axes.axvspan(each.low_kda, each.high_kda, color=BLUE, alpha=0.12, lw=0)
-            text = f"{each.mean_kda:.0f} kDa\n{each.count}"
-            middle = ((each.low_kda + each.high_kda) / 2, 0.98)
+            axes.axvspan(each.low, each.high, color=BLUE, alpha=0.12, lw=0)
+            text = f"{each.mean:.3g}\n{each.count}"
+            middle = ((each.low + each.high) / 2, 0.98)
             place_of: Style = {"xycoords": ("data", "axes fraction"), "ha": "center"}
             axes.annotate(text, middle, color=INK, va="top", **place_of)
-        bar = samples[0][1].bin_kda if samples else 1.0
+        bar = samples[0][1].bar if samples else 1.0
         label = "share of events" if shares else "events"
-        axes.set(xlabel="|mass| [kDa]", ylabel=f"{label} per {bar:g} kDa")
-        axes.set(xlim=(0, None), ylim=(0, None))
+        axes.set(xlabel="mass [kDa]", ylabel=f"{label} per {bar:g}", ylim=(0, None))
+        axes.set_xlim(left=min((float(mass.edges[0]) for _, mass in samples), default=0.0))
         if shares or curve is not None:
             axes.legend(loc="best")
     return figure

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tifffile
-from app_results import standards_result
+from app_results import standards_result, uncalibrated
 
 import iscat_analysis as ia
 from iscat_analysis.report.answer import answer_in
@@ -149,11 +149,10 @@ def test_a_click_gives_a_peak_its_mass_and_takes_it_back(standards: Path) -> Non
     calibrate.refresh()
     assert len(calibrate.peaks) == 3
     calibrate._standards.value = "264, 132"
-    calibrate._clicked(0.42)  # %, near 3.1e-5 · 132
-    calibrate._clicked(0.80)
-    calibrate._clicked(0.20)  # there is no third mass
+    for percent in (0.42, 0.80, 0.20):  # near 3.1e-5 · 132; there is no third mass
+        calibrate._clicked("pick", [{"x": percent}])
     assert calibrate.assigned == {1: 132.0, 2: 264.0}
-    calibrate._clicked(0.41)
+    calibrate._clicked("pick", [{"x": 0.41}])
     assert calibrate.assigned == {2: 264.0}
     calibrate._standards.value = "66"
     assert calibrate.assigned == {}
@@ -194,8 +193,8 @@ def test_the_command_that_is_exported_finds_the_species_of_the_window(
         results.rejections.reject(results.table.iloc[[0, 1, 5]])
         results._rejected_anew()
     results.begin.value = "60; 130, 260"
-    assert results._means() == [60.0, 130.0, 260.0]
-    results.start = results._means()
+    assert results.means() == [60.0, 130.0, 260.0]
+    results.start = results.means()
     inside = ia.find_species(results.events(), start_kda=results.start, draws=0)
     line = export._commands().splitlines()[-1]
     assert ("--limit 21:7" in line) == rejects
@@ -209,6 +208,31 @@ def test_the_command_that_is_exported_finds_the_species_of_the_window(
         np.testing.assert_allclose(outside[column], inside.species[column], rtol=1e-6)
     alone = ia.find_species(results._seen, start_kda=results.start, draws=0)  # without its folder
     assert abs(alone.species["efficiency"].iloc[0] - inside.species["efficiency"].iloc[0]) > 1e-3
+
+
+def test_masses_without_a_scale_are_contrasts_everywhere(standards: Path) -> None:
+    chosen, queue = Chosen(result=uncalibrated(standards)), Queue()
+    results, compare = Results(chosen), Compare(chosen, queue)
+    export = Export(chosen, results, compare)
+    for part in (results, export, compare):
+        part.refresh()
+    results.low.value, results.high.value = 3.0, 6.0
+    results._add_gate()
+    found = ia.find_species(results.events(), draws=0)
+    results._take({"distribution": found.to_dict()}, results._seen, None)
+    results._select()
+    assert results.means() == pytest.approx(found.species["mass_kda"].tolist(), rel=1e-3)
+    assert "contrast [10⁻³]" in results._species_table.object
+    assert all("10⁻³" in text for text in results.which.options)
+    assert export._gates().startswith(b"low,high,count")
+    compare._paths.value = [str(standards)]
+    assert compare.axis == "contrast [10⁻³]"
+    with pytest.raises(ia.DataError, match="no masses"):
+        compare._events()
+    parts = [part for tab in (results, export, compare) for part in tab.body.select()]
+    shown = [getattr(part, name, "") for part in parts for name in ("label", "object", "options")]
+    asked = "Approximate masses [kDa]"  # of what is to bind, which somebody knows
+    assert [text for text in map(str, shown) if "kDa" in text and text != asked] == []
 
 
 def test_a_file_that_is_dropped_is_saved_once_and_replaces_nothing(tmp_path: Path) -> None:
@@ -267,7 +291,7 @@ def test_a_run_that_cannot_be_fails_in_words_and_is_not_put_twice(tmp_path: Path
     assert f"--dark {tmp_path / 'd.tif'}" in camera.command
     queue.stop(run)
     assert run.state == "stopped"
-    assert queue.again(run) is not run
+    assert queue.add(run.job) is not run
 
 
 def test_names_are_text_whatever_is_in_them(tmp_path: Path) -> None:
