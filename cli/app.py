@@ -16,13 +16,13 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from iscat_cli import INTERRUPTED, answers, bounds, calibrate, day, fit, results, setup, study
+from iscat_cli import INTERRUPTED, answers, bounds, calibrate, day, fit, setup, study
 from iscat_cli.console import UNEXPECTED, Messages, silence
 from iscat_cli.options import Command
 
 _MOVIES = (setup.init, fit.fit, day.batch, day.watch, study.simulate)
 _ANSWERS = (bounds.bounds, study.benchmark, answers.species, answers.kd)
-_RESULTS = (fit.figures, results.export, results.view, results.app)
+_RESULTS = (fit.figures, fit.export, fit.view, fit.app)
 COMMANDS = (*_MOVIES, *_ANSWERS, *_RESULTS, setup.config)
 GROUPS = (
     ("calibrate", calibrate.SUMMARY, (calibrate.camera, calibrate.optics, calibrate.mass)),

@@ -9,28 +9,26 @@ Peaks are fitted to events, not to bins: a normal distribution on a flat backgro
 likelihood inside the peak's own window.  The line through the peaks is that of York et al., Am. J.
 Phys. 72, 367 (2004).
 
-`fit` finds the peaks, assigns them to standards and fits the line; `line` converts contrasts and
-stores the optics of the measurement.
+`line` finds the peaks, assigns them to standards, fits the line, converts contrasts and stores the
+optics of the measurement.
 """
 
 from __future__ import annotations
 
-from iscat_analysis.calibration.fit import (
+from iscat_analysis.calibration.line import (
     LEAST_EVENTS,
     STANDARD_ERROR,
-    calibrate_mass,
-    find_contrast_peaks,
-    york_line,
-)
-from iscat_analysis.calibration.line import (
     ContrastPeak,
     Landing,
     Line,
     MassCalibration,
     as_given,
+    calibrate_mass,
     contrast_over,
+    find_contrast_peaks,
     line_sigma_kda,
     mass_from_contrast,
     standards_of,
     with_standards,
+    york_line,
 )

@@ -68,4 +68,4 @@ from iscat_analysis.camera.noise import (
     shared_light,
     without_pattern_jitter,
 )
-from iscat_analysis.camera.transfer import SIGMAS, TOLERANCE, Law, LightZero, Response, find_zero
+from iscat_analysis.camera.transfer import SIGMAS, TOLERANCE, Law, LightZero, find_zero

@@ -48,13 +48,12 @@ from iscat_analysis.config.instrument import (
 from iscat_analysis.config.kinds import MODES, PARAMETERS, SCHEMES, ModeKind, SchemeKind, Way
 from iscat_analysis.config.named import Instrument, instruments
 from iscat_analysis.config.schema import INVISIBLE, Config, refuse_rod, refuse_sphere
-from iscat_analysis.config.synthetic import SIMULATED, SimulatedMover, Simulation
+from iscat_analysis.config.synthetic import SIMULATED, SimulatedMover
 from iscat_analysis.config.values import (
     ALL,
     LARGEST_NM,
     WAVELENGTH_NM,
     Mode,
-    Scheme,
     Section,
     SphereKind,
     plausible_pixel,

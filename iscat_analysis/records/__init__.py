@@ -11,17 +11,14 @@ from iscat_analysis.records.columns import (
     FRAME_COLUMN,
     FREE_PARAMETERS,
     NO_MODEL,
+    POOR_P,
     REPEAT_COLUMNS,
     TRACK_COLUMNS,
     TRACKS,
     Column,
-    free_parameters,
-    track_numbers,
-)
-from iscat_analysis.records.rows import (
-    POOR_P,
     counted,
     flagged,
+    free_parameters,
     has_flag,
     has_only,
     is_event,
@@ -29,10 +26,10 @@ from iscat_analysis.records.rows import (
     make_rows,
     species_rows,
     tally,
+    track_numbers,
     with_diameters,
 )
 from iscat_analysis.records.steps import (
-    NO_EVENT,
     SEVERITY,
     Alternative,
     Analysis,

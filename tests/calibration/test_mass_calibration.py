@@ -23,7 +23,7 @@ from iscat_analysis.calibration import (
     mass_from_contrast,
     york_line,
 )
-from iscat_analysis.calibration import fit as peaks
+from iscat_analysis.calibration import line as peaks
 from iscat_analysis.config import configure, parse_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.tables import read_events

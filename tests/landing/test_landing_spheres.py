@@ -13,7 +13,7 @@ from iscat_analysis.camera import Camera
 from iscat_analysis.camera.transfer import find_law, measure_transfer
 from iscat_analysis.config import Config
 from iscat_analysis.fitting import events
-from iscat_analysis.landing import measured_images
+from iscat_analysis.landing import steps
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.search.noise import measure_motion
 from iscat_analysis.study import write_stack
@@ -104,7 +104,7 @@ def test_spheres_are_given_up_where_none_describes_the_brightest_steps(
 ) -> None:
     """Ten points in optics that are wrong: eight were tried twice.  Control: good optics."""
     tried: list[str] = []
-    for where in (measured_images, events):
+    for where in (steps, events):
         monkeypatch.setattr(
             where, "recognised", lambda *_, at=where.__name__, **__: tried.append(at)
         )
@@ -129,4 +129,4 @@ def test_spheres_are_given_up_where_none_describes_the_brightest_steps(
         wrong = ia.configure(truth, settings={"optics.focus_nm": focus_nm})
         fit_stack(movie, wrong, out=tmp_path / f"at {focus_nm:g}")
         assert len(tried) == most
-        assert set(tried) <= {measured_images.__name__}
+        assert set(tried) <= {steps.__name__}

@@ -17,7 +17,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.instrument.uneven import is_plausible
 from iscat_analysis.landing import steps as steps_module
 from iscat_analysis.landing.maps import LEVELS, Searched
-from iscat_analysis.landing.measured_images import ring_average
+from iscat_analysis.landing.steps import ring_average
 from iscat_analysis.species import Efficiency
 
 SIDE, FRAMES = 112, 240
