@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Unpack, get_args
+from typing import TYPE_CHECKING, Any, Unpack, get_args
 
 import numpy as np
 import pandas as pd
@@ -26,7 +26,6 @@ from iscat_analysis.movie.tables import read_frame, refuse_twice
 from iscat_analysis.options import BindingOptions, EventOptions, only, takes
 from iscat_analysis.reading import is_file, is_folder, read_json
 from iscat_analysis.records import BoolArray, FloatArray
-from iscat_analysis.report.plots import Panels, plot_kd
 from iscat_analysis.report.species import binding_page
 from iscat_analysis.schemas import jsonable
 from iscat_analysis.species import LEAST_EVENTS
@@ -40,6 +39,9 @@ from iscat_analysis.species.equilibrium import (
 from iscat_analysis.species.tables import EventTable, event_table, mass_in, refuse_far, sentences
 from iscat_analysis.text import brief, from_table, in_table
 from iscat_analysis.units import count
+
+if TYPE_CHECKING:
+    from iscat_analysis.report.plots import Panels
 
 CONCENTRATIONS: dict[Model, tuple[str, ...]] = {
     "dimer": ("concentration_nm",),
@@ -119,6 +121,8 @@ class Binding:
         ConfigError
             The number of axes is another one.
         """
+        from iscat_analysis.report.plots import plot_kd  # Matplotlib takes long to import
+
         return plot_kd(jsonable(self.to_dict()), ax=ax)
 
 

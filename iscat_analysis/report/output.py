@@ -42,6 +42,10 @@ _ANSWERS = ("species", "comparison", "kd", "bounds", "benchmark", "challenge")
 PAGES = tuple(f"{name}.html" for name in ("report", "batch", *_CALIBRATIONS, *_ANSWERS))
 """Pages that the commands write."""
 
+FORMER = (".png", ".svg")
+"""Ends of names that earlier versions wrote beside a page, and ``figures``: what a folder lists may
+be replaced."""
+
 _HEADING = "Files of iscat-analysis; what is not in this list is never removed."
 _SIGNED = "lock of iscat-analysis, process "
 _SYSTEM_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
@@ -178,7 +182,8 @@ def _foreign(folder: Path, listed: Collection[str], known: Collection[str]) -> s
     """Find something in a folder that its list does not name."""
     for name in _inside(folder):
         top = name.partition("/")[0]
-        if name not in listed or not (top in known or top == FILE_LIST):
+        ours = top in known or top == FILE_LIST or top == "figures" or top.endswith(FORMER)
+        if name not in listed or not ours:
             return name
     return ""
 

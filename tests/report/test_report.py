@@ -150,6 +150,22 @@ class TestOverwrite:
             write_report(make_analysis(1), out)
         assert (out / "fits.csv").stat().st_mtime_ns == before
 
+    def test_figures_of_an_earlier_version_are_replaced_and_those_of_somebody_stay(
+        self, tmp_path: Path
+    ) -> None:
+        known = frozenset({"kd.csv", "kd.html"})
+        with atomic_folder(tmp_path / "out", known=known) as building:  # as it once was written
+            (building / "kd.csv").write_text("1")
+            (building / "figures").mkdir()
+            (building / "figures" / "kd.svg").write_text("<svg/>")
+            (building / "scan.png").write_text("")
+        with atomic_folder(tmp_path / "out", overwrite=True, known=known) as building:
+            (building / "kd.html").write_text("")
+        assert not (tmp_path / "out" / "figures").exists()
+        (tmp_path / "out" / "mine.png").write_text("")
+        with pytest.raises(DataError, match="holds 'mine.png'"):
+            check_output(tmp_path / "out", overwrite=True, known=known)
+
     def test_empty_and_absent_folders_are_fine_and_files_are_not(self, tmp_path: Path) -> None:
         check_output(tmp_path)
         check_output(tmp_path / "new" / "deeper")
