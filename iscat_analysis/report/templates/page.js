@@ -43,6 +43,7 @@ const iscat = (() => {
     const id = node.dataset.figure;
     const view = await show(node, held.figures[id], dataOf(id));
     views.set(id, view);
+    performance.mark(id);
     for (const listener of listeners) listener(id, view, node);
     const figure = node.closest("figure");
     if (figure && !figure.querySelector(".figure-tools")) figure.querySelector("figcaption").append(tools(id, node));
