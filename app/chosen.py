@@ -177,4 +177,5 @@ def numbers_in(text: str) -> list[float]:
 def link_to(page: Path, text: str) -> str:
     """Link to a page that the commands wrote."""
     address = html.escape("page?" + urlencode({"path": str(page)}))
-    return f'<a href="{address}" target="_blank" style="color: inherit">{html.escape(text)}</a>'
+    how = 'target="_blank" rel="noreferrer noopener" style="color: inherit"'
+    return f'<a href="{address}" {how}>{html.escape(text)}</a>'

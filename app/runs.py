@@ -149,12 +149,13 @@ class Queue:
                 run = next(r for r in self.runs if r.state == "waiting")
                 run.state = "running"
                 self.version += 1
-                context = get_context("spawn")
-                here, there = context.Pipe(duplex=False)
-                self._process = context.Process(target=_work_on, args=(run.job, there))
-                with _interrupts_held():
-                    self._process.start()
-                there.close()
+                try:
+                    here, self._process = _started(run.job)
+                except Exception as error:  # noqa: BLE001, whatever it is, the others have their turn
+                    run.state = "failed"
+                    run.say(f"the process could not be started: {type(error).__name__}: {error}")
+                    self.version += 1
+                    continue
             self._follow(run, here)
             self._process.join()
             with self._wake:
@@ -183,6 +184,16 @@ class Queue:
                     for line in what:
                         run.say(line)
                 self.version += 1
+
+
+def _started(job: Job) -> tuple[Connection, BaseProcess]:
+    """Start a process for a job, and give where it says how far it is."""
+    context = get_context("spawn")
+    here, there = context.Pipe(duplex=False)
+    process = context.Process(target=_work_on, args=(job, there))
+    with there, _interrupts_held():
+        process.start()
+    return here, process
 
 
 @contextmanager

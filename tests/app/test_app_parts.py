@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import shlex
+import time
 from pathlib import Path
 from typing import Any
 
@@ -292,6 +294,31 @@ def test_a_run_that_cannot_be_fails_in_words_and_is_not_put_twice(tmp_path: Path
     queue.stop(run)
     assert run.state == "stopped"
     assert queue.add(run.job) is not run
+
+
+def test_a_process_that_cannot_start_is_said_in_its_row_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Red before: the queue's thread ended, and later runs waited for ever."""
+    failures = iter([OSError("no room for a process"), MemoryError("nor for a pipe")])
+
+    def get_context(kind: str) -> Any:
+        for failure in failures:
+            raise failure
+        return multiprocessing.get_context(kind)
+
+    monkeypatch.setattr("iscat_app.runs.get_context", get_context)
+    queue = Queue()
+    names = ("a", "b", "c")
+    made = [queue.add(Job(tmp_path / f"{n}.tif", None, tmp_path / f"{n}.iscat")) for n in names]
+    end = time.monotonic() + 60
+    while not all(run.ended for run in made) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert [run.state for run in made] == ["failed"] * 3
+    assert made[0].log == ["the process could not be started: OSError: no room for a process"]
+    assert made[1].log == ["the process could not be started: MemoryError: nor for a pipe"]
+    assert "c.tif" in made[2].log[-1]  # which is not there
+    queue.close()
 
 
 def test_names_are_text_whatever_is_in_them(tmp_path: Path) -> None:
