@@ -306,8 +306,7 @@ def _negative_floor_adu(camera: Camera, dtype: np.dtype[Any]) -> float | FloatAr
     """Lowest plausible count: offset less six standard deviations of read noise and rounding."""
     rounding = 1 / 12 if np.issubdtype(dtype, np.integer) else 0.0
     sigma = np.sqrt(np.square(np.divide(camera.read_noise_e, camera.gain_e_per_adu)) + rounding)
-    floor: float | FloatArray = camera.offset_adu - 6.0 * sigma  # 1e-9 of pixels in the dark
-    return floor
+    return camera.offset_adu - 6.0 * sigma  # 1e-9 of pixels in the dark
 
 
 def refuse_ratio(frame: NDArray[Any], where: str, camera: Camera) -> None:

@@ -65,7 +65,7 @@ class Trajectory:
             return np.broadcast_to(self.shift_px[0], (*at.shape, 2)).copy()
         k = np.clip(np.searchsorted(known, at) - 1, 0, known.size - 2)
         share = ((at - known[k]) / (known[k + 1] - known[k]))[..., None]
-        return np.asarray((1 - share) * self.shift_px[k] + share * self.shift_px[k + 1])
+        return (1 - share) * self.shift_px[k] + share * self.shift_px[k + 1]
 
 
 def follow_pattern(

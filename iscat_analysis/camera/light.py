@@ -118,7 +118,7 @@ class Fringes:
             phase = np.outer(np.arange(n) - (n - 1) / 2, self.waves[:, axis])
             turns = np.hstack([np.cos(phase), np.sin(phase)])
             heights = _polynomials(n, self.degree)
-            return np.asarray((turns[:, :, None] * heights[:, None]).reshape(n, -1))
+            return (turns[:, :, None] * heights[:, None]).reshape(n, -1)
 
         same = np.tile(np.eye(len(self.waves)), (2, 2))
         return functions(0), functions(1), np.kron(same, _up_to(self.degree)) > 0
@@ -182,7 +182,7 @@ def _polynomials(n: int, degree: int) -> FloatArray:
 def _up_to(degree: int) -> BoolArray:
     """Which products of polynomials have at most a degree, shape (degree + 1, degree + 1)."""
     degrees = np.arange(degree + 1)
-    return np.asarray(np.add.outer(degrees, degrees) <= degree)
+    return np.add.outer(degrees, degrees) <= degree
 
 
 def lift(light_e: FloatArray) -> FloatArray:
@@ -257,7 +257,7 @@ class LightModel:
             mixed = (rows.T @ (light * more) @ columns)[products]
             gram = np.block([[gram, mixed[:, None]], [mixed, np.sum(light * more**2)]])
         # directions of which the field tells less than that share of the best one are left out
-        return np.asarray(np.linalg.pinv(gram, rcond=1e-10, hermitian=True))
+        return np.linalg.pinv(gram, rcond=1e-10, hermitian=True)
 
     def _distribution(self, seen: FloatArray) -> FloatArray:
         """Fit all components to the light of frames (…, y, x), over the mean light."""
@@ -648,7 +648,7 @@ def _without_smooth(change: FloatArray, degree: int) -> FloatArray:
     """Subtract the polynomial of a degree from changes (pairs, y, x)."""
     rows, columns, products = Smooth(degree).axes((change.shape[1], change.shape[2]))
     rows, columns = (np.linalg.qr(functions)[0] for functions in (rows, columns))
-    return np.asarray(change - rows @ (products * (rows.T @ change @ columns)) @ columns.T)
+    return change - rows @ (products * (rows.T @ change @ columns)) @ columns.T
 
 
 def _peak(change: FloatArray, slowest: float) -> FloatArray | None:
@@ -783,7 +783,7 @@ def _cell_squares(cells: FloatArray, basis: FloatArray) -> tuple[FloatArray, flo
 
 def _near(deviations: FloatArray) -> BoolArray:
     """Tell which deviations, in standard deviations of noise, are no outliers."""
-    return np.asarray(np.abs(deviations) <= 4.0 * max(1.0, robust_sigma(deviations)))
+    return np.abs(deviations) <= 4.0 * max(1.0, robust_sigma(deviations))
 
 
 # ---- added light -----------------------------------------------------------------------------

@@ -182,7 +182,7 @@ class _Pattern:
 
     def motion(self, changes: FloatArray) -> FloatArray:
         """Fit the slopes to changes (k, p) over their noise: the motion along −y and −x."""
-        return np.asarray(changes @ self.slopes_in_noise.T @ self.covariance)
+        return changes @ self.slopes_in_noise.T @ self.covariance
 
 
 @dataclass(frozen=True)

@@ -664,7 +664,7 @@ def response_of(law: Law, found: Transfer, camera: Camera, top: float) -> Respon
         end = min(top, zero + _HIGHEST * full)
 
         def light(above: FloatArray) -> FloatArray:
-            return np.asarray(-np.log1p(-above / full))
+            return -np.log1p(-above / full)
 
         n = light(np.minimum(mean, _HIGHEST * full))
         contrast = n / np.expm1(n)

@@ -36,7 +36,7 @@ _FEWEST_ROWS, _FEWEST_RESIDUES = 5, 12  # rows of a kind that make it worth a li
 _NORMAL = (0.4549, 1.3863)  # medians of χ² with one and two degrees of freedom
 
 
-def axes_warning(name: str, counts: NDArray[Any], most: int = 96) -> Finding | None:
+def axes_warning(name: str, counts: NDArray[Any]) -> Finding | None:
     """Find whether time seems to run along the rows or columns of the frames.
 
     Images along the time axis change least, relative to their means: a pixel's light repeats but
@@ -44,7 +44,8 @@ def axes_warning(name: str, counts: NDArray[Any], most: int = 96) -> Finding | N
 
     Shapes: `counts` (t, y, x).
     """
-    middle = tuple(slice(max(n - most, 0) // 2, (n + most) // 2) for n in counts.shape)
+    # 96 frames, rows and columns at most
+    middle = tuple(slice(max(n - 96, 0) // 2, (n + 96) // 2) for n in counts.shape)
     part = counts[middle].astype(np.float64)
     part = part[np.isfinite(part).all(axis=(1, 2))]
     if len(part) < 2:
@@ -124,12 +125,12 @@ def uneven_warning(
     return of.LIGHT_UNEVEN({**values, "or_method": method}, where=name)
 
 
-def misfit_warning(config: Config, events: Sequence[Event], brightest: int = 8) -> str:
+def misfit_warning(config: Config, events: Sequence[Event]) -> str:
     """Say what is probably wrong with the model, where it fails for the brightest particles."""
     if config.optics.psf == "measured":
         return ""
     alone = [e for e in events if not _DISTURBED.intersection(e.flags)]
-    tested = sorted(alone, key=lambda e: -e.snr)[:brightest]
+    tested = sorted(alone, key=lambda e: -e.snr)[:8]
     missed = [e for e in tested if Status.POOR_FIT in e.flags]
     if 2 * len(missed) <= len(tested):
         return ""

@@ -188,4 +188,4 @@ def _repeats(movie: Stack, camera: Camera, span: tuple[int, int]) -> BoolArray:
         light, repeats = measure_frames(movie.read(begin, stop), camera)
         here = slice(start - span[0], stop - span[0])
         light_e[here], same[here] = light[start - begin :], repeats[start - begin :]
-    return np.asarray(same & well_lit(light_e, DARK))
+    return same & well_lit(light_e, DARK)

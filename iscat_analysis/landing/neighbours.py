@@ -228,8 +228,7 @@ class Neighbours:
         image = step.image[inside].astype(np.float64)
         shares = self.presence(step, before), self.presence(step, after)
         if self.pattern is None:
-            factor: FloatArray = (1 + shares[1] * image) / (1 + shares[0] * image)
-            return factor
+            return (1 + shares[1] * image) / (1 + shares[0] * image)
         blocks, windows = self._presences(step), (before, after)
         held = tuple(float(self.pattern.weights(before, after, w) @ blocks) for w in windows)
         if shares == held:
@@ -239,8 +238,7 @@ class Neighbours:
             / (1 + known * self.seen(step, window, inside))
             for window, share, known in zip(windows, shares, held, strict=True)
         ]
-        moving: FloatArray = light[1] / light[0]
-        return moving
+        return light[1] / light[0]
 
     def apply(
         self, ratio: FloatArray, step: Step, before: slice, after: slice, region: Region
@@ -318,8 +316,7 @@ class Neighbours:
         """`factor` of the step that is fitted, but for its image at its mean place in a window."""
         with_it = after if step.sign > 0 else before
         model = 1 + self.seen(step, with_it, inside, smeared=False)
-        factor: FloatArray = self.factor(step, before, after, inside) / model**step.sign
-        return factor
+        return self.factor(step, before, after, inside) / model**step.sign
 
     def change(self, step: Step, before: slice, after: slice) -> tuple[NDArray[np.floating], float]:
         """Contrast that a step's particle makes between ranges of frames: a multiple of an image.
@@ -353,10 +350,12 @@ class Neighbours:
         (y, x), (yy, yx, xx) = self.pattern.moments(frames, step.at.frame)
         if not smeared:
             yy, yx, xx = y * y, y * x, x * x
-        seen: FloatArray = image + np.einsum(
-            "k,kyx->yx", [-y, -x, yy / 2, yx, xx / 2], step.drawn.slopes[(slice(None), *inside)]
+        return np.asarray(
+            image
+            + np.einsum(
+                "k,kyx->yx", [-y, -x, yy / 2, yx, xx / 2], step.drawn.slopes[(slice(None), *inside)]
+            )
         )
-        return seen
 
     def of(
         self, steps: Sequence[Step], frames: int = 0

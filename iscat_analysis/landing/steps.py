@@ -287,7 +287,7 @@ def ring_average(
         off = np.abs(value - image) * accuracy
         scale = max(1.0, float(np.median(off[accuracy > 0])) / 0.6745)
         kept = accuracy**2 * np.minimum(1.0, 3 * scale / np.maximum(off, 1e-9)) ** 2
-    return np.asarray(image.reshape(contrast.shape))
+    return image.reshape(contrast.shape)
 
 
 # Of the threshold; a fit that reaches less is what other steps explain

@@ -543,14 +543,15 @@ def _held(
         lengths = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
         place = info.header_offset + _LOCAL_HEADER.size + sum(lengths) + header.offset
         return Member(*header[:3], info.file_size - header.offset, place)
-    unpack = partial(_unpack_npy, archive, info, header.offset)
+    unpack = partial(_passed_over, partial(archive.open, info), header.offset)
     return Member(*header[:3], info.compress_size, unpack=unpack)
 
 
-def _unpack_npy(archive: zipfile.ZipFile, info: zipfile.ZipInfo, start: int) -> IO[bytes]:
-    packed = archive.open(info)
-    packed.read(start)
-    return packed
+def _passed_over(unpack: Callable[[], IO[bytes]], count: int) -> IO[bytes]:
+    """Open bytes, and leave out the first of them."""
+    unpacked = unpack()
+    unpacked.read(count)
+    return unpacked
 
 
 _HEADER_BYTES = 128
@@ -618,8 +619,8 @@ def arrays_of_mat(file: BinaryIO, path: Path) -> dict[str, Member | str]:
                 "again or save it again"
             )
         if kind == _COMPRESSED:
-            unpacked: Any = io.BufferedReader(_Inflating(file, start, size))
-            name, held = _variable(unpacked, order, 8)
+            inflated: Any = partial(_inflated, file, start, size)
+            name, held = _variable(inflated(), order, 8)
         elif kind == _MATRIX:
             name, held = _variable(file, order, 0)
         else:
@@ -631,15 +632,13 @@ def arrays_of_mat(file: BinaryIO, path: Path) -> dict[str, Member | str]:
         if kind == _MATRIX:
             found[name] = Member(shape, stored, COLUMNS_TOGETHER, nbytes, start + skipped)
         else:
-            unpack = partial(_unpack, file, start, size, skipped)
+            unpack = partial(_passed_over, inflated, skipped)
             found[name] = Member(shape, stored, COLUMNS_TOGETHER, size, unpack=unpack)
     return found
 
 
-def _unpack(file: BinaryIO, start: int, size: int, skipped: int) -> Any:
-    packed = io.BufferedReader(_Inflating(file, start, size))
-    packed.read(skipped)
-    return packed
+def _inflated(file: BinaryIO, start: int, size: int) -> Any:
+    return io.BufferedReader(_Inflating(file, start, size))
 
 
 def _variable(

@@ -440,7 +440,6 @@ class DatasetFrames:
         self,
         stored: StoredArray,
         reader: Hdf5Reader,
-        metadata: StackMetadata | None = None,
         notes: tuple[str, ...] = (),
         *,
         by_columns: bool = False,
@@ -449,7 +448,7 @@ class DatasetFrames:
         y, x = stored.shape[:-3:-1] if by_columns else stored.shape[-2:]
         self.shape = (stored.shape[0], y, x)
         self.dtype = stored.dtype
-        self.metadata, self.notes = metadata or StackMetadata(), notes
+        self.metadata, self.notes = StackMetadata(), notes
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames ``[start, stop)`` as a new array in native byte order [counts]."""

@@ -198,9 +198,9 @@ class Stack:
         files: Sequence[Path] | None = None,
         metadata: StackMetadata | None = None,
     ) -> None:
-        self._path = path
+        self.path = path
         self._frames = frames
-        self._metadata = frames.metadata if metadata is None else metadata
+        self.metadata = frames.metadata if metadata is None else metadata
         self._channel: tuple[int, int] | None = None
         self._part = part
         self._files = (path,) if files is None else tuple(files)
@@ -225,7 +225,7 @@ class Stack:
         """Let another process open the same file."""
         if not self._files or not self._own:
             raise TypeError(f"{self.name} is no file that another process could open")
-        path = self._path.absolute()
+        path = self.path.absolute()
         address = Path(f"{path}{MARK}{self._part}") if self._part else path
         return _reopened, (address, self.identity, self._left_out, self._channel)
 
@@ -236,14 +236,9 @@ class Stack:
         self.close()
 
     @property
-    def path(self) -> Path:
-        """The file, or the name of the array."""
-        return self._path
-
-    @property
     def name(self) -> str:
         """The file's name, without its folder, as text that can be written."""
-        return printable(self._path.name + (MARK + self._part if self._part else ""))
+        return printable(self.path.name + (MARK + self._part if self._part else ""))
 
     @property
     def identity(self) -> str:
@@ -251,7 +246,7 @@ class Stack:
         try:
             return fingerprint(self._files, self._part) if self._files else ""
         except OSError as error:
-            raise DataError(f"{self._path}: can no longer be read ({error.strerror})") from None
+            raise DataError(f"{self.path}: can no longer be read ({error.strerror})") from None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -262,11 +257,6 @@ class Stack:
     def dtype(self) -> np.dtype[Any]:
         """Type of the stored counts, in native byte order."""
         return self._frames.dtype
-
-    @property
-    def metadata(self) -> StackMetadata:
-        """What the file, or a text beside it, says of the recording."""
-        return self._metadata
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -310,7 +300,7 @@ class Stack:
         """
         if chosen is None:
             return self
-        (channels, which), total, known = chosen, self.shape[0], self._metadata
+        (channels, which), total, known = chosen, self.shape[0], self.metadata
         images = range(which, total, channels)
         if len(images) < 2:
             raise DataError(
@@ -324,7 +314,7 @@ class Stack:
             known = replace(known, frame_rate_hz=known.frame_rate_hz / channels)
         where = np.array([(0, image) for image in images])
         seen = self._again(FileSet([self._frames], self._files, where, known, self.notes))
-        seen._metadata, seen._channel = known, chosen
+        seen.metadata, seen._channel = known, chosen
         return seen
 
     def without(self, pixels: BoolArray, dark: NDArray[Any]) -> Stack:
@@ -496,7 +486,7 @@ class Stack:
         total = self.shape[0]
         if not 0 <= start <= stop <= total:
             raise DataError(
-                f"{self._path}: frames [{start}, {stop}) were asked for, but it holds "
+                f"{self.path}: frames [{start}, {stop}) were asked for, but it holds "
                 f"[0, {total}); choose frames inside that range"
             )
 

@@ -578,7 +578,7 @@ def _column(reader: Hdf5Reader, name: str, path: Path) -> FloatArray | None:
         raise DataError(
             f"{path}: {name} has the shape {found.shape}, not one value per event; export it again"
         )
-    return np.asarray(found.read(0, found.shape[0]).astype(np.float64).reshape(-1))
+    return found.read(0, found.shape[0]).astype(np.float64).reshape(-1)
 
 
 def _calibration(reader: Hdf5Reader, group: str, path: Path) -> tuple[float, float] | None:

@@ -239,7 +239,7 @@ class RatioFilm:
         first, stop = self.frames
         self._sum_around(min(max(frame, first), stop - 1))
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(self._after / self._before - 1.0)
+            return self._after / self._before - 1.0
 
     def light(self, most: int = 400) -> pd.DataFrame:
         """Give light and noise of frames all over the movie, at most so many, fewer of large ones.
