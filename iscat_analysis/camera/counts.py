@@ -252,7 +252,10 @@ def check_counts(
     """
     camera = camera or Camera(full_scale_adu=full_scale_of(counts.dtype))
     lowest, highest = (extreme(axis=(1, 2)).tolist() for extreme in (counts.min, counts.max))
-    floor = _negative_floor_adu(camera, counts.dtype)
+    # below the offset by six standard deviations of read noise and rounding: 1e-9 of dark pixels
+    rounding = 1 / 12 if np.issubdtype(counts.dtype, np.integer) else 0.0
+    sigma = np.sqrt(np.square(np.divide(camera.read_noise_e, camera.gain_e_per_adu)) + rounding)
+    floor: float | FloatArray = camera.offset_adu - 6.0 * sigma
     ceiling = _ceiling_adu(camera)
     highest_floor, lowest_ceiling = float(np.max(floor)), float(np.min(ceiling))
     for number, (frame, low, high) in enumerate(zip(counts, lowest, highest, strict=True)):
@@ -300,13 +303,6 @@ def _refuse_negative(frame: NDArray[Any], floor: float | FloatArray, where: str)
         f"(lowest count {float(frame.min()):g}); give raw counts, or correct camera.offset_adu and "
         "camera.read_noise_e"
     )
-
-
-def _negative_floor_adu(camera: Camera, dtype: np.dtype[Any]) -> float | FloatArray:
-    """Lowest plausible count: offset less six standard deviations of read noise and rounding."""
-    rounding = 1 / 12 if np.issubdtype(dtype, np.integer) else 0.0
-    sigma = np.sqrt(np.square(np.divide(camera.read_noise_e, camera.gain_e_per_adu)) + rounding)
-    return camera.offset_adu - 6.0 * sigma  # 1e-9 of pixels in the dark
 
 
 def refuse_ratio(frame: NDArray[Any], where: str, camera: Camera) -> None:

@@ -319,17 +319,6 @@ class LightModel:
         """
         return np.broadcast_to(self.factors(self.light_e * (1 + signal)), signal.shape)
 
-    def left(self, signal: FloatArray) -> FloatArray:
-        """Give what is left of a signal after the division.
-
-        Shapes: `signal` (y, x), result (y, x).
-        """
-        return (1 + signal) / self.taken(signal) - 1
-
-    def part(self, here: tuple[slice, slice]) -> PartOfLight:
-        """Give what is done to signals in some pixels of the field."""
-        return PartOfLight(self, here)
-
 
 @dataclass(frozen=True, eq=False)
 class PartOfLight:
@@ -346,10 +335,6 @@ class PartOfLight:
         whole = np.zeros(self.whole.light_e.shape)
         whole[self.here] = signal
         return self.whole.taken(whole)[self.here]
-
-    def left(self, signal: FloatArray) -> FloatArray:
-        """Give what is left of a signal after the division."""
-        return (1 + signal) / self.taken(signal) - 1
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from iscat_analysis.diagnosis.causes import (
     smear_warning,
     uneven_warning,
 )
-from iscat_analysis.diagnosis.frames import without_cut_off
+from iscat_analysis.diagnosis.frames import light_and_repeats, without_cut_off
 from iscat_analysis.diagnosis.light import DRIFT_PX, drift_warning, examine_background
 from iscat_analysis.diagnosis.noise import (
     SPECTRUM_FRAMES,

@@ -28,7 +28,7 @@ from iscat_analysis.findings.camera import FRAMES_DARK, REPEATS_LEFT_OUT
 from iscat_analysis.fitting.ranges import frame_ranges
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.movie import ChangedFrames, SelectedFrames, Stack
-from iscat_analysis.records import BoolArray, Windows
+from iscat_analysis.records import BoolArray, FloatArray, Windows
 from iscat_analysis.search.frames import DARK, cut_off, measure_frames, well_lit
 from iscat_analysis.units import are, frames_listed
 
@@ -124,12 +124,11 @@ class KeptFrames:
 
     movie: Stack
     config: Config
-    configured: Config
     numbers: IntArray | None = None
     finding: Finding | None = None
 
-    def put_back(self, found: DetectionResult) -> DetectionResult:
-        """Give what was found the numbers of the file, and the ranges that were configured."""
+    def put_back(self, found: DetectionResult, asked: Config) -> DetectionResult:
+        """Give what was found the numbers of the file, and the configuration with their ranges."""
         if self.numbers is None:
             return found
         compared, numbers = found.compared, self.numbers
@@ -142,13 +141,11 @@ class KeptFrames:
             light[kept - span[0]], rest = np.split(rest, [kept.size])
             spans.append(span)
             power.append(light)
-        asked = {"background": self.configured.background, "fit": self.configured.fit}
-        own = found.context.config.model_copy(update=asked)
         frame = numbers[found.fits["frame"].to_numpy(dtype=np.int64)]
         compared = replace(
             compared, frames_before=spans[0], frames_after=spans[1], power=np.concatenate(power)
         )
-        context = replace(found.context, config=own)
+        context = replace(found.context, config=asked)
         return replace(
             found, context=context, fits=found.fits.assign(frame=frame), compared=compared
         )
@@ -160,12 +157,16 @@ def without_repeats(movie: Stack, config: Config, camera: Camera) -> KeptFrames:
     spans = [span for span in (before, after) if span is not None]
     used = np.concatenate([np.arange(*span) for span in spans])
     if used.max() >= movie.shape[0] or np.diff(used).min(initial=1) < 1:  # refused later
-        return KeptFrames(movie, config, config)
-    kept = [span[0] + np.flatnonzero(~_repeats(movie, camera, span)) for span in spans]
+        return KeptFrames(movie, config)
+    seen = [light_and_repeats(movie, camera, span) for span in spans]
+    kept = [
+        span[0] + np.flatnonzero(~(same & well_lit(light_e, DARK)))
+        for span, (light_e, same) in zip(spans, seen, strict=True)
+    ]
     numbers = np.concatenate(kept)
     missing = np.setdiff1d(used, numbers)
     if not missing.size or min(part.size for part in kept) < 2:  # nothing else is there
-        return KeptFrames(movie, config, config)
+        return KeptFrames(movie, config)
     middle = kept[0].size if before is not None else 0
     own = config.changed(
         background={} if before is None else {"frames": (0, middle)},
@@ -174,18 +175,20 @@ def without_repeats(movie: Stack, config: Config, camera: Camera) -> KeptFrames:
     words = {"repeat": "repeats" if missing.size == 1 else "repeat", "are": are(missing.size)}
     words["frames"] = frames_listed(missing)
     finding = REPEATS_LEFT_OUT({**words, "of": used.size}, where=movie.name)
-    return KeptFrames(movie.seen_as(SelectedFrames(movie, numbers)), own, config, numbers, finding)
+    return KeptFrames(movie.seen_as(SelectedFrames(movie, numbers)), own, numbers, finding)
 
 
-def _repeats(movie: Stack, camera: Camera, span: tuple[int, int]) -> BoolArray:
-    """Tell which frames of a range repeat the one before, and have light.
+def light_and_repeats(
+    movie: Stack, camera: Camera, span: tuple[int, int]
+) -> tuple[FloatArray, BoolArray]:
+    """Measure the light of the frames of a range, and tell which repeat the one before.
 
-    Shapes: result (t,).
+    Shapes: both (t,).
     """
     light_e, same = np.empty(span[1] - span[0]), np.empty(span[1] - span[0], dtype=np.bool_)
     for start in range(*span, _READ):
         begin, stop = max(start - 1, span[0]), min(start + _READ, span[1])
-        light, repeats = measure_frames(movie.read(begin, stop), camera)
         here = slice(start - span[0], stop - span[0])
-        light_e[here], same[here] = light[start - begin :], repeats[start - begin :]
-    return same & well_lit(light_e, DARK)
+        measured = measure_frames(movie.read(begin, stop), camera)
+        light_e[here], same[here] = (each[start - begin :] for each in measured)
+    return light_e, same

@@ -73,7 +73,7 @@ class AnalysisContext:
             corner_nm = tile.corner[0] * self.pixel_nm, tile.corner[1] * self.pixel_nm
             local = tuple(models.on_tile(corner_nm) for models in local)
         if isinstance(lines, LightModel):
-            lines = lines.part(tile.here)
+            lines = PartOfLight(lines, tile.here)
         if noise is not None:
             noise = noise.on(tile.shape)
         templates = replace(self.templates, noise=noise)
@@ -119,7 +119,7 @@ class AnalysisContext:
 
         Shapes: `signal` (y, x), result (y, x).
         """
-        return signal if self.lines is None else self.lines.left(signal)
+        return signal if self.lines is None else (1 + signal) / self.lines.taken(signal) - 1
 
     def contrasts(self, amplitude: FloatArray) -> FloatArray:
         """Give the peak contrast of particles at the nominal height."""

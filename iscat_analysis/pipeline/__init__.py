@@ -141,8 +141,15 @@ def analyse(movie: Stack, config: Config, run: Run | None = None, *, command: st
     with compiling(run.notify):
         kind = kind_of(config)
         ready = prepare(movie, config, run)  # load, calibrate
-        if kind.inject is None:
-            _refuse_injection(run, movie.name)
+        if kind.inject is None and run.executor.distant:
+            run.notify(
+                f"{movie.name}: is analysed in this process: only landing movies have chunks"
+            )
+        if kind.inject is None and run.inject:
+            raise ConfigError(
+                f"`inject` = {run.inject}: particles are added to landing movies only, which have "
+                'an interferometric scheme and background.method = "sliding"; leave it out'
+            )
         found = kind.find(ready, run)  # background, detect, fit, posterior, bounds
         with parts_kept(run.partial if kind.keeps_parts else None):
             extra: dict[str, Any] = {}
@@ -233,14 +240,3 @@ def _with_standards(config: Config, state: Prepared) -> Config:
             "`iscat calibrate mass` writes a line with its optics"
         )
     return found
-
-
-def _refuse_injection(run: Run, name: str) -> None:
-    """Refuse to inject particles, and say that workers are idle, where windows do not slide."""
-    if run.executor.distant:
-        run.notify(f"{name}: is analysed in this process: only landing movies have chunks")
-    if run.inject:
-        raise ConfigError(
-            f"`inject` = {run.inject}: particles are added to landing movies only, which have an "
-            'interferometric scheme and background.method = "sliding"; leave it out'
-        )

@@ -85,7 +85,9 @@ def find_before_after(ready: Prepared, run: Run, fit: Fit) -> DetectionResult:
     with threads(ready.config.compute.workers) as pool:
         found = fit(ready, run, ground, pool)
     run.clock.lap("results")
-    return found if ready.kept is None else ready.kept.put_back(found)
+    if ready.kept is None:
+        return found
+    return ready.kept.put_back(found, ready.with_frames_asked(found.context.config))
 
 
 def background_context(ready: Prepared, windows: Windows) -> tuple[AnalysisContext, Noise]:

@@ -184,9 +184,9 @@ class RatioFilm:
 
     def __init__(self, movie: Stack, *, window: int = 1, offset_adu: float = 0.0) -> None:
         self.movie = movie
-        self._offset = float(offset_adu)
+        self.offset_adu = float(offset_adu)
         self._window = 0
-        self._at = -1
+        self._summed = -1, 0.0  # the frame that sums are around, and the offset of their counts
         shape = movie.shape[1:]
         self._before, self._after = np.zeros(shape), np.zeros(shape)
         self.window = window
@@ -201,17 +201,7 @@ class RatioFilm:
         """Take means of so many frames from now on."""
         frames = int(number_in("`window`", frames, least=1, most=self.longest, whole=True))
         if frames != self._window:
-            self._window, self._at = frames, -1
-
-    @property
-    def offset_adu(self) -> float:
-        """Counts of a pixel without light."""
-        return self._offset
-
-    @offset_adu.setter
-    def offset_adu(self, counts: float) -> None:
-        """Take contrasts over another offset from now on."""
-        self._offset, self._at = float(counts), -1
+            self._window, self._summed = frames, (-1, 0.0)
 
     @property
     def longest(self) -> int:
@@ -250,7 +240,7 @@ class RatioFilm:
         last, most = self.movie.shape[0] - 2, self._affordable(2, most)
         rows = []
         for frame in np.unique(np.linspace(0, last, min(most, last + 1)).astype(int)):
-            pair = self.movie.read(int(frame), int(frame) + 2).astype(np.float64) - self._offset
+            pair = self.movie.read(int(frame), int(frame) + 2).astype(np.float64) - self.offset_adu
             light = pair.mean(axis=(1, 2))
             with np.errstate(divide="ignore", invalid="ignore"):
                 change = (pair[1] / light[1]) / (pair[0] / light[0])
@@ -278,20 +268,21 @@ class RatioFilm:
 
     def _frame(self, number: int) -> FloatArray:
         counts: FloatArray = self.movie.read(number, number + 1)[0].astype(np.float64)
-        counts -= self._offset
+        counts -= self.offset_adu
         light = float(counts.mean())
         if not light > 0:
             raise ConfigError(
                 f"{self.movie.name}: frame {number} is no brighter than camera.offset_adu = "
-                f"{self._offset:g}: correct the offset"
+                f"{self.offset_adu:g}: correct the offset"
             )
         counts /= light
         return counts
 
     def _sum_around(self, frame: int) -> None:
         """Sum the frames before one and from it on, from the last sums where these are near."""
-        window, last, self._at = self._window, self._at, -1  # an error leaves no sums
-        if last < 0 or abs(frame - last) > window // 2:
+        window, (last, offset) = self._window, self._summed
+        self._summed = -1, 0.0  # an error leaves no sums
+        if last < 0 or offset != self.offset_adu or abs(frame - last) > window // 2:
             self._before[:], self._after[:] = 0.0, 0.0
             for number in range(window):
                 self._before += self._frame(frame - window + number)
@@ -302,4 +293,4 @@ class RatioFilm:
                 passing = self._frame(number)
                 self._before += sign * (passing - self._frame(number - window))
                 self._after += sign * (self._frame(number + window) - passing)
-        self._at = frame
+        self._summed = frame, self.offset_adu

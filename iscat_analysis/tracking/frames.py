@@ -43,6 +43,7 @@ from iscat_analysis.camera import (
     trusted,
 )
 from iscat_analysis.config import Config
+from iscat_analysis.diagnosis import light_and_repeats
 from iscat_analysis.errors import DataError
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings.tracks import BLOCKS_FOLLOW_DRIFT, TRACKED_FRAMES_LEFT_OUT
@@ -50,7 +51,7 @@ from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.movie import SelectedFrames, Stack
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, IntArray, Progress, Windows
-from iscat_analysis.search.frames import DARK, measure_frames, well_lit
+from iscat_analysis.search.frames import DARK, well_lit
 from iscat_analysis.tracking.field import Exposures, MovingField
 from iscat_analysis.tracking.rows import BackgroundEstimate, Localizations
 from iscat_analysis.units import count, listed
@@ -274,12 +275,7 @@ def keep_frames(
     movie: Stack, camera: Camera, span: tuple[int, int], *, additive: bool = False
 ) -> FrameSubset:
     """Leave out frames that repeat others or have no light."""
-    light_e, repeats = np.empty(span[1] - span[0]), np.empty(span[1] - span[0], dtype=np.bool_)
-    for start in range(*span, _READ):
-        begin, stop = max(start - 1, span[0]), min(start + _READ, span[1])
-        here = slice(start - span[0], stop - span[0])
-        measured = measure_frames(movie.read(begin, stop), camera)
-        light_e[here], repeats[here] = (each[start - begin :] for each in measured)
+    light_e, repeats = light_and_repeats(movie, camera, span)
     dark = np.isneginf(light_e) if additive else ~well_lit(light_e, DARK)
     good = ~(dark | repeats)
     if good.all() or not good.any():

@@ -82,7 +82,7 @@ def test_what_is_left_of_a_particle_is_foreseen() -> None:
     grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
     signal = context.wide.image(grid, 30 * PIXEL_NM, 24 * PIXEL_NM, 5.0, 1000.0)
     lines = LightModel(_light(), shares=(0.3, 0.0))
-    left = lines.left(signal)
+    left = (1 + signal) / lines.taken(signal) - 1
     rng = np.random.default_rng(4)
     flicker = 1 + 1e-3 * rng.standard_normal((2, SHAPE[0], 1))
     frames = flicker * _light() * np.stack([np.ones(SHAPE), 1 + signal])
