@@ -88,15 +88,17 @@ class Estimators:
     time_limit: Annotated[float, typer.Option(min=1.0)] = 600.0
     archive: Path | None = None
 
-    def found(self) -> list[Estimator]:
+    def found(self, messages: Messages) -> list[Estimator]:
         """Find the estimators, all of which can run here."""
         from iscat_analysis.errors import ConfigError
-        from iscat_contest.estimators import find_estimator
+        from iscat_contest.estimators import BUILT_IN, TRUSTED, find_estimator
 
         estimators = [find_estimator(text) for text in self.estimator or ()]
         for one in estimators:
             if one.missing:
                 raise ConfigError(f"estimator {one.name}: {one.missing}")
+        if not {*estimators} <= {*BUILT_IN}:
+            messages.note(f"estimators of others are {TRUSTED}")
         return estimators
 
 
@@ -194,7 +196,7 @@ def benchmark(
     from iscat_contest.benchmark import run_benchmark, write_benchmark
     from iscat_contest.scoring import write_archive
 
-    others = estimators.found()
+    others = estimators.found(messages)
     output.check(BENCHMARK_NAMES)
     how: Any = {"time_limit_s": estimators.time_limit, "command": messages.command}
     with messages.progress() as progress:
@@ -367,7 +369,7 @@ def score(
     from iscat_contest.challenge import read_challenge
     from iscat_contest.scoring import score_challenge
 
-    others = estimators.found()
+    others = estimators.found(messages)
     read = read_challenge(challenge, truth)
     how: Any = {"time_limit_s": estimators.time_limit, "command": messages.command}
     with messages.progress() as progress:

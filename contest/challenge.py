@@ -11,22 +11,24 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+import math
 import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import pandas as pd
 import tifffile
+from pydantic import BaseModel, ConfigDict, Field
 
 from iscat_analysis.bounds import paper
-from iscat_analysis.config import Config, config_to_toml, parse_config, refuse_sphere
+from iscat_analysis.config import LARGEST_NM, Config, config_to_toml, parse_config, refuse_sphere
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import sha256_of_files, whole_file
-from iscat_analysis.reading import is_file, read_json, toml_of
+from iscat_analysis.reading import first_line, is_file, model_of, read_text, toml_of
 from iscat_analysis.records import PARAMETERS, FloatArray, Progress, silent
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.study import Setting, make_setting, trial_generator, write_stack
@@ -41,6 +43,64 @@ STEPS_PER_ELECTRON = 1024
 """Expected counts are rounded to this part of a photoelectron."""
 
 
+_Hash = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+_Name = Annotated[str, Field(pattern=r"^\w{1,100}$")]
+_File = Annotated[str, Field(pattern=r"^(stacks|movies|config)/\w[\w.]{0,100}$")]
+_Text = Annotated[str, Field(max_length=1000)]
+_Frame = Annotated[int, Field(ge=0, le=10_000_000)]
+_Place = Annotated[float, Field(ge=-LARGEST_NM, le=LARGEST_NM)]
+
+
+class _About(BaseModel):
+    """What a manifest says of a part; the other keys follow from its configuration."""
+
+    model_config = ConfigDict(extra="allow")
+
+    kind: Literal["stacks", "movie"]
+    mode: Literal["mass", "localize", "joint"]
+    about: _Text
+
+
+class _Manifest(BaseModel):
+    """The form of a manifest."""
+
+    format: Literal["iscat-challenge"]
+    version: Literal[1]
+    name: _Text
+    blind: bool
+    made_by: _Text
+    files: dict[_File, _Hash]
+    truth_sha256: _Hash
+    parts: Annotated[dict[_Name, _About], Field(min_length=1)]
+
+
+class _Event(BaseModel):
+    """The form of a particle in a truth."""
+
+    part: _Name
+    file: _File
+    event: int
+    frame: _Frame
+    leave: _Frame | None
+    x_nm: _Place
+    y_nm: _Place
+    z_nm: _Place
+    mass_kda: Annotated[float, Field(gt=0, le=1e12)]
+
+
+class _Truth(BaseModel):
+    """The form of a truth."""
+
+    format: Literal["iscat-challenge"]
+    version: Literal[1]
+    seed: int
+    parts: dict[_Name, Annotated[dict[Literal["config"], str], Field(min_length=1)]]
+    events: list[_Event]
+
+
+M = TypeVar("M", bound=BaseModel)
+
+
 @dataclass(frozen=True)
 class Challenge:
     """A challenge that was read; its files and its truth are those of its manifest."""
@@ -51,12 +111,12 @@ class Challenge:
 
     def told(self, part: str) -> Config:
         """Give what participants know of a part."""
-        text = (self.folder / "config" / f"{part}.toml").read_text(encoding="utf-8")
-        return parse_config(toml_of(text))
+        path = self.folder / "config" / f"{part}.toml"
+        return _config_in(path, str(path))
 
     def true(self, part: str) -> Config:
         """Give how a part was made."""
-        return parse_config(toml_of(self.truth["parts"][part]["config"]))
+        return _config_in(self.truth["parts"][part]["config"], f"{TRUTH}: parts.{part}.config")
 
     def events(self, part: str) -> list[dict[str, Any]]:
         """Give the particles of a part."""
@@ -77,8 +137,10 @@ def make_challenge(
     chosen = secrets.randbits(48) if seed is None and blind else seed if seed is not None else 1
     beside = truth_beside(out)
     check_output(out, overwrite, known=KNOWN)
-    if blind and beside.exists() and not overwrite:
-        raise DataError(f"{beside}: exists already; move it, or pass `overwrite`")
+    if blind and beside.exists():
+        if not overwrite:
+            raise DataError(f"{beside}: exists already; move it, or pass `overwrite`")
+        _read(_Truth, beside, "is to be replaced", "it is no truth of ours: move it")
     with atomic_folder(out, overwrite, known=KNOWN) as building:
         (building / "config").mkdir()
         events: list[dict[str, Any]] = []
@@ -128,14 +190,7 @@ def truth_beside(folder: Path) -> Path:
 
 def read_challenge(folder: Path, truth: Path | None = None) -> Challenge:
     """Read a challenge with its truth, and refuse one whose files are not those of its manifest."""
-    manifest = _json(folder / MANIFEST, "is no challenge")
-    if manifest.get("format") != FORMAT:
-        raise DataError(f"{folder / MANIFEST}: is not the manifest of a challenge")
-    if manifest.get("version") != VERSION:
-        raise DataError(
-            f"{folder}: is of version {manifest.get('version')} and this program scores {VERSION}; "
-            "make the challenge again"
-        )
+    manifest = _read(_Manifest, folder / MANIFEST, "is no challenge").model_dump()
     for name, expected in manifest["files"].items():
         path = folder / name
         if not is_file(path):
@@ -156,7 +211,39 @@ def read_challenge(folder: Path, truth: Path | None = None) -> Challenge:
         raise DataError(
             f"{where}: is not the truth of this challenge (its SHA-256 is not the manifest's)"
         )
-    return Challenge(folder, manifest, _json(where, "is no truth"))
+    challenge = Challenge(folder, manifest, _read(_Truth, where, "is no truth").model_dump())
+    _refuse_contradictions(challenge, where)
+    return challenge
+
+
+def _refuse_contradictions(challenge: Challenge, truth: Path) -> None:
+    """Refuse a manifest that is not of the truth's configurations and particles."""
+    if (parts := challenge.manifest["parts"]).keys() != challenge.truth["parts"].keys():
+        raise DataError(f"{truth}: parts: are not those of the manifest; {_AGAIN}")
+    for number, event in enumerate(challenge.truth["events"]):
+        if event["file"] not in challenge.manifest["files"]:
+            raise DataError(f"{truth}: events.{number}.file: is not in the manifest; {_AGAIN}")
+    for name, about in parts.items():
+        made, told = challenge.true(name), challenge.told(name)
+        known = told.model_copy(update={"bounds": made.bounds, "simulation": made.simulation})
+        events = challenge.events(name)
+        part = Part(name, about["kind"], made, known, about=about["about"])
+        for key, value in _described(part, events).items():
+            if about.get(key) != value:
+                raise DataError(
+                    f"{challenge.folder / MANIFEST}: parts.{name}.{key}: is not {value!r}, as its "
+                    f"configuration and its truth have it; {_AGAIN}"
+                )
+        frames = about.get("frames", about.get("n_before", 0) + 1)
+        for number, event in enumerate(events):
+            late = event["frame"] >= frames, (event["leave"] or math.inf) <= event["frame"]
+            if event["event"] != number or any(late):
+                key = "event" if not any(late) else "frame"
+                raise DataError(
+                    f"{truth}: {name}, particle {number}: {key}: is impossible; {_AGAIN}"
+                )
+        if not events:
+            raise DataError(f"{truth}: events: has none of part {name}; {_AGAIN}")
 
 
 def manifest_sha256(folder: Path) -> str:
@@ -247,13 +334,26 @@ def _described(part: Part, events: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return about | {"stacks": len(events), **{name: getattr(told.bounds, name) for name in names}}
 
 
-def _json(path: Path, what: str) -> dict[str, Any]:
+_AGAIN = "get the challenge again, or make it with this program"
+
+
+def _read(model: type[M], path: Path, what: str, remedy: str = _AGAIN) -> M:
+    """Read a document of a challenge."""
     try:
-        found = dict(read_json(path))
+        return model_of(model, read_text(path))
     except OSError as error:
         raise DataError(f"{path.parent}: {what} ({path.name}: {error.strerror})") from None
-    except (TypeError, ValueError):
-        raise DataError(f"{path}: is damaged; get the challenge again") from None
+    except ValueError as error:
+        raise DataError(f"{path}: {first_line(error)}; {remedy}") from None
+
+
+def _config_in(text: str | Path, where: str) -> Config:
+    """Read a configuration of a challenge."""
+    try:
+        found = parse_config(toml_of(read_text(text) if isinstance(text, Path) else text))
+        refuse_sphere(found, "challenges are of dipoles")
+    except (OSError, ValueError, ConfigError) as error:
+        raise DataError(f"{where}: {first_line(error)}; {_AGAIN}") from None
     return found
 
 

@@ -28,6 +28,9 @@ from iscat_analysis.study import EstimatorSetup
 GROUP = "iscat_analysis.estimators"
 """Entry points of packages that offer estimators."""
 
+TRUSTED = "trusted code: they could read what the user can, a truth that is at hand among it"
+"""What scores say of estimators of others: no system walls off processes of one user."""
+
 COLUMNS = (*PARAMETERS, "amplitude")
 """What an estimator may return, each also with ``sigma_`` before its name."""
 

@@ -10,6 +10,7 @@ import json
 import math
 import re
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -27,13 +28,13 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.executors import versions
 from iscat_analysis.files import sha256_of_files, whole_file
 from iscat_analysis.movie import open_stack
-from iscat_analysis.reading import is_folder
+from iscat_analysis.reading import LARGEST_TEXT_BYTES, OF_DAMAGE, is_folder, open_regular
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Progress, silent
 from iscat_analysis.report import CHALLENGE_NAMES, atomic_folder, render_challenge
 from iscat_analysis.schemas import to_json
 from iscat_analysis.study import Limits, matched, resamples, score_estimates
 from iscat_contest.challenge import Challenge, manifest_sha256
-from iscat_contest.estimators import Estimator
+from iscat_contest.estimators import BUILT_IN, TRUSTED, Estimator
 from iscat_contest.process import Answer, Job, job_of, run_estimators
 from iscat_contest.results import (
     Results,
@@ -113,6 +114,8 @@ def score_challenge(
         )
     about = {key: manifest[key] for key in ("name", "version", "blind", "made_by", "truth_sha256")}
     about["manifest_sha256"] = manifest_sha256(challenge.folder)
+    if not {*estimators} <= {*BUILT_IN}:
+        about["estimators"] = TRUSTED
     document = _document(f"Challenge {manifest['name']}", about, hashes, parts, command)
     return document | ({"table_1": table_1(parts)} if manifest["name"] == "dong2021" else {})
 
@@ -343,6 +346,8 @@ def _job(challenge: Challenge, group: _Group) -> _Cut:
     truths = group.limits.truths
     for file, mine in events.groupby("file", sort=False):
         with open_stack(challenge.folder / str(file)) as stack:
+            if side > min(stack.shape[1:]):
+                raise DataError(f"{file}: is smaller than fit.roi_nm, {side} pixels; lower it")
             for i, first in mine["frame"].items():
                 random = study.trial_generator(SEED, 3000, int(i))
                 place = np.rint(truths[i, 1::-1] / pixel + random.uniform(-1, 1, 2)).astype(int)
@@ -426,10 +431,26 @@ def bibtex(title: str, document: str) -> str:
     )
 
 
+def _is_ours(archive: Path) -> bool:
+    """Tell whether an archive holds what its list of sums names, and nothing else."""
+    try:
+        with open_regular(archive) as file, zipfile.ZipFile(file) as packed:
+            names = packed.namelist()
+            folder = names[0].partition("/")[0]
+            with packed.open(f"{folder}/SHA256SUMS") as sums:
+                lines = sums.read(LARGEST_TEXT_BYTES).decode().splitlines()
+    except (zipfile.BadZipFile, zlib.error, *OF_DAMAGE):
+        return False
+    listed = (line.partition("  ")[2] for line in lines)
+    return {*names} == {f"{folder}/{name}" for name in (*listed, "SHA256SUMS", ".zenodo.json")}
+
+
 def write_archive(folder: Path, archive: Path, *, title: str, overwrite: bool = False) -> None:
     """Pack a folder with what a repository of data asks for; equal scores give equal bytes."""
     if archive.exists() and not overwrite:
         raise DataError(f"{archive}: exists already; give another name, or pass `overwrite`")
+    if archive.exists() and not _is_ours(archive):
+        raise DataError(f"{archive}: is no archive of ours, and is left alone; give another name")
     files = sorted(p for p in folder.rglob("*") if p.is_file() and not p.name.startswith("."))
     about = {
         "title": title,

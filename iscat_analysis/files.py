@@ -17,6 +17,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from iscat_analysis.errors import DataError
+from iscat_analysis.reading import open_regular
 
 _UNFINISHED: dict[Path, bool] = {}  # all true; the last begun is last
 _NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
@@ -93,7 +94,7 @@ def sha256_of_files(files: Sequence[Path], part: str = "") -> str:
     digest = hashlib.sha256()
     for path in files:
         try:
-            with path.open("rb", buffering=0) as file:
+            with open_regular(path) as file:
                 hashlib.file_digest(file, lambda: digest)
         except OSError as error:
             raise DataError(f"{path}: cannot be read ({error.strerror})") from None

@@ -71,7 +71,7 @@ def is_folder(path: Path) -> bool:
         return False
 
 
-def open_regular(path: Path, most: int | None = None) -> BinaryIO:
+def open_regular(path: Path, most: int | None = None) -> io.BufferedReader:
     """Open a regular file, of so many bytes at most, and never wait for a pipe."""
     try:
         handle = os.open(path, _FLAGS | getattr(os, "O_CLOEXEC", 0))

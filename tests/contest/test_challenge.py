@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
+import os
+import re
+import shutil
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +16,12 @@ import pytest
 from microscopes import configuration
 
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.files import sha256_of_files
 from iscat_analysis.movie import open_stack
 from iscat_contest.challenge import (
     ABOUT,
+    MANIFEST,
+    TRUTH,
     Challenge,
     make_challenge,
     manifest_sha256,
@@ -28,6 +36,7 @@ from iscat_contest.scoring import score_challenge, write_archive, write_scores
 
 PIXEL_NM = 84.4
 STACKS = 24
+_LEFT_OUT = object()
 
 
 def _parts():
@@ -127,6 +136,103 @@ def test_files_that_are_not_those_of_the_manifest_are_refused(tmp_path: Path) ->
         read_challenge(tmp_path)
 
 
+def _leaves(values: object, at: tuple[object, ...] = ()) -> list[tuple[object, ...]]:
+    """Give the places of all values in a document, of lists the first two and the last."""
+    if isinstance(values, dict):
+        inside = list(values.items())
+    elif isinstance(values, list):
+        inside = list(enumerate(values))
+        inside = [*inside[:2], *inside[-1:]]
+    else:
+        return [at]
+    return [at, *(leaf for key, one in inside for leaf in _leaves(one, (*at, key)))]
+
+
+_ODD = (None, "", "../../x", -1, 2, 1e300, 2**70, math.nan, [], {"a": 1}, "x" * 10_000)
+
+
+def test_a_folder_with_one_changed_value_is_refused_with_its_key(
+    folder: Path, estimates, tmp_path: Path
+) -> None:
+    """Whoever changes a truth changes its hash, too.  What can still be scored is scored."""
+    out = tmp_path / "small"
+    shutil.copytree(folder, out)
+    estimates.to_csv(tmp_path / "ours.csv", index=False)
+    texts = {name: (out / name).read_text(encoding="utf-8") for name in (MANIFEST, TRUTH)}
+    refused = scored = 0
+    for name, text in texts.items():
+        for place in _leaves(json.loads(text)):
+            for odd in (*_ODD, _LEFT_OUT):
+                document, manifest = json.loads(text), json.loads(texts[MANIFEST])
+                holder = {"": document}
+                for key in ("", *place)[:-1]:
+                    holder = holder[key]
+                if odd is _LEFT_OUT:
+                    del holder[("", *place)[-1]]
+                    document = document if place else {}
+                else:
+                    holder[("", *place)[-1]] = odd
+                    document = document if place else odd
+                (out / name).write_text(json.dumps(document), encoding="utf-8")
+                if name == TRUTH:
+                    manifest["truth_sha256"] = sha256_of_files([out / TRUTH])
+                    (out / MANIFEST).write_text(json.dumps(manifest), encoding="utf-8")
+                try:
+                    read = read_challenge(out)
+                    score_challenge(read, [tmp_path / "ours.csv"])
+                    scored += 1
+                except DataError as error:
+                    refused += 1
+                    line = str(error)
+                    assert len(line) < 1000
+                    assert str(out) in line or TRUTH in line
+        for each, kept in texts.items():
+            (out / each).write_text(kept, encoding="utf-8")
+    assert refused > 1000
+    assert scored > 20
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        (MANIFEST, lambda m: m.update(version=2), "version: Input should be 1; get the challenge"),
+        (MANIFEST, lambda m: m["files"].update({"../a": "0" * 64}), "files.../a"),
+        (MANIFEST, lambda m: m["parts"]["stack"].update(n_before=10**9), "n_before: is not 6"),
+        (MANIFEST, lambda m: m["parts"].update({"../a": m["parts"]["stack"]}), "parts.../a"),
+        (
+            TRUTH,
+            lambda t: t["events"][3].update(x_nm="12"),
+            "events.3.x_nm: Input should be a valid",
+        ),
+        (TRUTH, lambda t: t["events"][3].update(file="stacks/b.tif"), "events.3.file: is not in"),
+        (TRUTH, lambda t: t["events"].append(t["events"][0]), "stacks: is not 25"),
+        (TRUTH, lambda t: t["events"][-1].update(frame=160), "particle 5: frame: is impossible"),
+        (TRUTH, lambda t: t["parts"]["stack"].update(config="[optics\n"), "parts.stack.config: "),
+    ],
+)
+def test_a_changed_challenge_names_file_and_key(change, name, said, folder, tmp_path: Path) -> None:
+    out = tmp_path / "small"
+    shutil.copytree(folder, out)
+    for which in (name, MANIFEST):
+        document = json.loads((out / which).read_text(encoding="utf-8"))
+        if which == name:
+            change(document)
+        if which == MANIFEST:
+            document["truth_sha256"] = sha256_of_files([out / TRUTH])
+        (out / which).write_text(json.dumps(document), encoding="utf-8")
+    with pytest.raises(DataError, match=re.escape(said)) as caught:
+        read_challenge(out)
+    assert "get the challenge again" in str(caught.value)
+
+
+def test_only_a_truth_is_replaced_by_a_truth(tmp_path: Path) -> None:
+    beside = truth_beside(tmp_path / "blind")
+    beside.write_text('{"of": "somebody"}', encoding="utf-8")
+    with pytest.raises(DataError, match="no truth of ours"):
+        make_challenge(_parts()[:1], tmp_path / "blind", name="s", blind=True, overwrite=True)
+    assert beside.read_text(encoding="utf-8") == '{"of": "somebody"}'
+
+
 def test_presets_are_there() -> None:
     for name in ABOUT:
         parts = preset_parts(name)
@@ -165,6 +271,47 @@ def test_the_same_score_twice_to_the_byte(challenge, estimates, tmp_path) -> Non
         one, two = (tmp_path / which / name for which in ("first", "second"))
         assert one.is_dir() or one.read_bytes() == two.read_bytes(), name
     assert (tmp_path / "first.zip").read_bytes() == (tmp_path / "second.zip").read_bytes()
+
+
+def test_an_archive_replaces_none_but_its_own(challenge, estimates, tmp_path: Path) -> None:
+    archive = tmp_path / "scores.zip"
+    write_scores(_scored(challenge, estimates, tmp_path / "ours.csv"), tmp_path / "scores")
+    for _ in range(2):
+        write_archive(tmp_path / "scores", archive, title="small", overwrite=True)
+    with zipfile.ZipFile(archive, "a") as packed:
+        packed.writestr("scores/mine.txt", "of mine")
+    kept = archive.read_bytes()
+    for content in (kept, b"a letter", b""):
+        archive.write_bytes(content)
+        with pytest.raises(DataError, match="no archive of ours, and is left alone"):
+            write_archive(tmp_path / "scores", archive, title="small", overwrite=True)
+        assert archive.read_bytes() == content
+
+
+def test_a_pipe_is_no_table_of_results(challenge, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "r.csv")
+    with pytest.raises(DataError, match="a pipe or a device; give a file"):
+        score_challenge(challenge, [tmp_path / "r.csv"])
+
+
+@pytest.mark.parametrize("blind", [False, True])
+def test_who_reads_the_truth_is_found_by_withholding_it(
+    blind, folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Blurred, a truth that was read looks like an estimate; of a blind challenge there is none."""
+    out, truth = tmp_path / "small", tmp_path / "elsewhere" / "of.json"
+    shutil.copytree(folder, out)
+    if blind:
+        truth.parent.mkdir()
+        (out / TRUTH).rename(truth)
+    monkeypatch.setenv("CHALLENGE", str(out))
+    read = read_challenge(out, truth if blind else None)
+    found = score_challenge(read, [], [find_estimator("estimators_for_tests:reads_the_truth")])
+    (entry,) = found["parts"]["stack"]["estimators"].values()
+    assert entry["failed"] == (STACKS if blind else 0)
+    if blind:
+        assert "FileNotFoundError" in next(iter(entry["failures"]))
+    assert found["challenge"]["estimators"].startswith("trusted code")
 
 
 def test_tables_of_other_programs_give_the_same_score(challenge, estimates, tmp_path) -> None:
