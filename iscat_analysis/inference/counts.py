@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iscat_analysis.camera import smooth_background
-from iscat_analysis.errors import DataError
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import mask_of, pixels_of
-from iscat_analysis.inference.laws import CONDITIONAL, POISSON, NoiseLaw, law_named
+from iscat_analysis.inference.laws import CONDITIONAL, NOISE_LAWS, POISSON, NoiseLaw
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.records import BoolArray, FloatArray
@@ -189,9 +189,11 @@ def choose_noise(name: str, *, interferes: bool, counted: bool) -> NoiseLaw:
 
     The conditional law is for light that interferes with a background whose frames were counted.
     """
-    if name != "auto":
-        return law_named(name)
-    return CONDITIONAL if interferes and counted else POISSON
+    if name == "auto":
+        return CONDITIONAL if interferes and counted else POISSON
+    if name not in NOISE_LAWS:
+        raise ConfigError(f"noise = {name!r}: give one of {', '.join(NOISE_LAWS)}")
+    return NOISE_LAWS[name]
 
 
 def counts_likelihood(

@@ -299,7 +299,7 @@ def _optima(likelihood: Likelihood, theta: FloatArray, box: Box) -> tuple[list[O
             # no particle there
             optima.append(Optimum(begin, value, 0, False, np.zeros((5, 5))))
             continue
-        found = _follow(likelihood, _inside(begin, box), box, best)
+        found = likelihood.maximize(_inside(begin, box), box, least=best - FOLLOWED)
         optima.append(found)
         if found.converged and found.log_likelihood > best:
             best = found.log_likelihood
@@ -308,17 +308,12 @@ def _optima(likelihood: Likelihood, theta: FloatArray, box: Box) -> tuple[list[O
             plain = bool(min(best, alone) > PLAIN)
     if optima and (sized or (plain and model.rho > 0)):
         return _ranked(optima), sized
-    return _ranked([*optima, _follow(likelihood, theta, box, best)]), True
+    return _ranked([*optima, likelihood.maximize(theta, box, least=best - FOLLOWED)]), True
 
 
 def _inside(theta: FloatArray, box: Box) -> FloatArray:
     """Clip θ to a box; fixed parameters have a range of zero."""
     return np.minimum(np.maximum(theta, box.lower), box.upper)
-
-
-def _follow(likelihood: Likelihood, theta: FloatArray, box: Box, best: float) -> Optimum:
-    """Fit from a start, and give up when it cannot end within `FOLLOWED` of the best."""
-    return likelihood.maximize(theta, box, least=best - FOLLOWED)
 
 
 def _ranked(optima: list[Optimum]) -> list[Optimum]:
@@ -356,7 +351,7 @@ def _also_from(
     likelihood: Likelihood, theta: FloatArray, box: Box, optima: list[Optimum], found: _Found
 ) -> tuple[list[Optimum], _Found]:
     """Fit from one more start, and keep the result if it is the best."""
-    last = _follow(likelihood, theta, box, found.best.log_likelihood)
+    last = likelihood.maximize(theta, box, least=found.best.log_likelihood - FOLLOWED)
     ranked = _ranked([*optima, last])
     return ranked, found if ranked[0] is found.best else _judged(likelihood, ranked[0], box)
 

@@ -22,7 +22,6 @@ from scipy.special import betainc, gammainc, gammaincc, pdtr, pdtrc
 
 from iscat_analysis._kernels import noise
 from iscat_analysis._kernels.scoring import signal_value
-from iscat_analysis.errors import ConfigError
 from iscat_analysis.records import BoolArray, FloatArray
 
 MANY_COUNTS = 1e6
@@ -220,13 +219,6 @@ CONDITIONAL, POISSON = Conditional(), Poisson()
 
 NOISE_LAWS: Mapping[str, NoiseLaw] = {law.name: law for law in (CONDITIONAL, POISSON)}
 """Every noise law, by the name that ``fit.likelihood`` gives it."""
-
-
-def law_named(name: str) -> NoiseLaw:
-    """Look up a noise law; another name is refused."""
-    if name not in NOISE_LAWS:
-        raise ConfigError(f"noise = {name!r}: give one of {', '.join(NOISE_LAWS)}")
-    return NOISE_LAWS[name]
 
 
 def attainable_tails(rate: FloatArray, tail: float) -> FloatArray:

@@ -128,10 +128,6 @@ class FieldOfView:
             )
         ]
 
-    def jumping(self, images: Images, between: tuple[int, int]) -> FieldOfView:
-        """Add a jump of the focus that lies between two pictures, in the order of time."""
-        return replace(self, jumps=(*self.jumps, jump_frame(self, images, between)))
-
     def optics(self, config: Config) -> Config:
         """Say in a configuration for what part of the sample and what time its terms hold."""
         update = {
@@ -411,7 +407,8 @@ def in_uneven_field(
         refused.add(change.kind)
         terms, seen_by, judged, least = tuple(change.terms), view, pictures, before
         if change.kind == JUMP:
-            seen_by = view.jumping(best.images, (change.jump - 1, change.jump))
+            frame = jump_frame(view, best.images, (change.jump - 1, change.jump))
+            seen_by = replace(view, jumps=(*view.jumps, frame))
             judged = seen_by.placed(seen_by.undivided(pictures))
             least = tried(judged, values, names)[1]
         start = {**best.values, **dict.fromkeys(terms, 0.0)}

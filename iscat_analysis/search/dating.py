@@ -94,7 +94,8 @@ def find_rise(
         return Rise(0, turn, 0.0, 1.0, ()), profile
     begins = centre - rise / 2 + rise * np.linspace(-0.25, 0.25, 11)
     shares = (0.15, 0.25, 0.35, 0.5, 0.7)  # of the frames of the line, that the light decays in
-    curves = [_settling(lit, rise * share, begins[:, None]) for share in shares]
+    since = np.maximum(lit + 0.5 - begins[:, None], 0.0)
+    curves = [-np.expm1(-since / (rise * share)) for share in shares]  # of new light
     settling = tuple(float(_gains(curve, w, y).max()) - gain for curve in curves)
     p_line = float(erfc(np.sqrt(max(*settling, 0.0))))  # of χ² with one degree of freedom
     height = _gain_beyond(heights, weight, centre, rise // 2 + 1)
@@ -129,11 +130,6 @@ def _common(profiles: Sequence[tuple[float, ...]]) -> int:
 def line(frames: IntArray, rise: int, centre: int) -> FloatArray:
     """Share of the new light in frames during a linear rise."""
     return np.asarray(np.clip((frames + 0.5 - centre) / rise + 0.5, 0.0, 1.0))
-
-
-def _settling(frames: IntArray, decay: float, begin: FloatArray) -> FloatArray:
-    """Share of the new light in frames during an exponential rise."""
-    return np.asarray(-np.expm1(-np.maximum(frames + 0.5 - begin, 0.0) / decay))
 
 
 def _gains(traces: FloatArray, weight: FloatArray, heights: FloatArray) -> FloatArray:

@@ -72,7 +72,7 @@ class Trials:
 
 def trial_generator(seed: int, stream: int, trial: int) -> np.random.Generator:
     """Random numbers of one trial."""
-    return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, stream, trial])))
+    return np.random.default_rng([seed, stream, trial])
 
 
 def run_trials(

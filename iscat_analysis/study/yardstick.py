@@ -49,7 +49,7 @@ def resamples(count: int, seed: int) -> FloatArray:
 
     Shapes: result (RESAMPLES + 1, count).
     """
-    random = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, count])))
+    random = np.random.default_rng([seed, count])
     out = np.ones((RESAMPLES + 1, count))
     for row in range(1, RESAMPLES + 1):
         out[row] = np.bincount(random.integers(0, count, count), minlength=count)
