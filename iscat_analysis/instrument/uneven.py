@@ -20,6 +20,7 @@ from scipy.special import chdtrc
 
 from iscat_analysis.config import JUMPS, MOVES, Config
 from iscat_analysis.fitting.ranges import background_mode, fitted_frames
+from iscat_analysis.inference.maximiser import covariance_of
 from iscat_analysis.instrument.joint_fit import Estimate, PictureScores, maximise
 from iscat_analysis.instrument.measure import HELD_OUT
 from iscat_analysis.instrument.particle_image import (
@@ -258,9 +259,8 @@ class _ScoreTests:
         size, errors = step[len(self.shared) :], covariance[len(self.shared) :, len(self.shared) :]
         if not np.all(np.diag(errors) > 0):
             return size, 0.0
-        unit = 1 / np.sqrt(np.diag(errors))  # where all pictures have one place errors are singular
-        inverse = np.linalg.pinv(errors * np.outer(unit, unit), hermitian=True)
-        return size, float((size * unit) @ inverse @ (size * unit))
+        # where all pictures have one place errors are singular
+        return size, float(size @ covariance_of(errors, np.ones(size.size, dtype=bool)) @ size)
 
     def _change(
         self, kind: str, names: tuple[str, ...], slopes: FloatArray, trials: int = 1

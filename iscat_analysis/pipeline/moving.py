@@ -160,7 +160,7 @@ class StoredTracks:
         order = np.lexsort((track, frame))
         rows = Localizations.of(frame, track.astype(np.int64), theta)
         speeds = np.array([self._diffusion.get(int(n), 0.0) for n in numbers]).reshape(-1, 1)
-        rows, variances = blurred_rows(rows, speeds, exposure_of(config)[1])
+        rows, variances = blurred_rows(rows, speeds, exposure_of(config))
         with threads(config.compute.workers) as pool:
             check = checked(movie, camera)
             recording = Recording(movie, camera, check, pool, silent)

@@ -60,13 +60,13 @@ from iscat_analysis.records import (
     silent,
 )
 from iscat_analysis.search.frames import DARK, well_lit
-from iscat_analysis.species.diffusion import gather
 from iscat_analysis.species.tracks import rows_by_track
 from iscat_analysis.threads import start_in_thread, threads
 from iscat_analysis.tracking.blocks import Block, BlockStore, analyse_block, join_blocks
 from iscat_analysis.tracking.frames import (
     Plan,
     Recording,
+    diffusion_of_positions,
     exposure_of,
     keep_frames,
     plan_blocks,
@@ -132,17 +132,14 @@ def beside_particles(context: AnalysisContext, windows: Windows, fits: pd.DataFr
 
 def _path_variance_nm2(config: Config, fits: pd.DataFrame) -> float:
     """Median variance of the paths of long tracks about their means, in an exposure."""
-    rate, exposure_s = exposure_of(config)
     if config.camera.frame_rate_hz is None:
         return 0.0
-    found = []
+    found: list[float] = []
     for rows in rows_by_track(fits).values():
         placed = rows.placed()
         if len(placed.frame) >= config.track.min_frames:
-            track = gather(*placed.positions(), frame_rate_hz=rate, exposure_ms=1e3 * exposure_s)
-            d, _ = track.estimate()
-            found += [d] * len(placed.frame)
-    return path_variance_nm2(max(float(np.median(found)), 0.0), exposure_s) if found else 0.0
+            found += [diffusion_of_positions(config, *placed.positions())[0]] * len(placed.frame)
+    return path_variance_nm2(max(float(np.median(found or [0.0])), 0.0), exposure_of(config))
 
 
 _STEPS = 100  # of the progress of a block

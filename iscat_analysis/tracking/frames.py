@@ -52,6 +52,7 @@ from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.movie import SelectedFrames, Stack
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, IntArray, Progress, Windows
 from iscat_analysis.search.frames import DARK, well_lit
+from iscat_analysis.species.diffusion import gather
 from iscat_analysis.tracking.field import Exposures, MovingField
 from iscat_analysis.tracking.rows import BackgroundEstimate, Localizations
 from iscat_analysis.units import count, listed
@@ -314,12 +315,24 @@ LEAST_FRAMES = 20
 _BLOCK = 16  # frames that are read or searched at a time; what more of them need is slow to clear
 
 
-def exposure_of(config: Config) -> tuple[float, float]:
-    """Give the frame rate and the exposure."""
+def exposure_of(config: Config) -> float:
+    """Give the exposure [s], or where the frame rate is not known 1."""
     rate, exposure = config.camera.frame_rate_hz, config.camera.exposure_ms
     if rate is None:
-        return 1.0, 1.0
-    return rate, 1 / rate if exposure is None else exposure / 1e3
+        return 1.0
+    return 1 / rate if exposure is None else exposure / 1e3
+
+
+def diffusion_of_positions(
+    config: Config, frames: IntArray | FloatArray, places_nm: FloatArray, sigma_nm: FloatArray
+) -> tuple[float, float]:
+    """D of a track and its standard error [µm²/s], or where the frame rate is not known per frame.
+
+    Shapes: `frames` (n,), `places_nm` and `sigma_nm` (n, 2).
+    """
+    rate, exposure_ms = config.camera.frame_rate_hz or 1.0, 1e3 * exposure_of(config)
+    track = gather(frames, places_nm, sigma_nm, frame_rate_hz=rate, exposure_ms=exposure_ms)
+    return track.estimate()
 
 
 def tracking_context(

@@ -27,9 +27,9 @@ from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.optics.model import blurred, path_variance_nm2
 from iscat_analysis.optics.sized import LARGEST_INDEX, LEAST_CONTRAST, SizedModel
 from iscat_analysis.records import FloatArray, Status, verdict
-from iscat_analysis.species.diffusion import LEAST_POSITIONS, gather, hydrodynamic_diameter
+from iscat_analysis.species.diffusion import LEAST_POSITIONS, hydrodynamic_diameter
 from iscat_analysis.species.tracks import SLOWED_BY_WALL, Correlation
-from iscat_analysis.tracking.frames import exposure_of
+from iscat_analysis.tracking.frames import diffusion_of_positions, exposure_of
 from iscat_analysis.tracking.table import ALONG, path_shifts
 
 _SHOWS_SIZE = {Status.AMBIGUOUS_SIZE, Status.AMBIGUOUS_Z}
@@ -68,7 +68,7 @@ def sphere_track(
     if not used:
         return SphereTrack(model, [*events], [], np.zeros((0, 10)))
     d_um2_s, sigma_d = _diffusion(context, used)
-    variance = path_variance_nm2(d_um2_s, exposure_of(context.config)[1])
+    variance = path_variance_nm2(d_um2_s, exposure_of(context.config))
     averaged = blurred(model, variance, upwards=True)
     likelihoods = [replace(event.likelihood, model=averaged) for event in used]
     frames = SphereFrames(likelihoods, averaged, context.config.fit.z_range_nm)
@@ -151,13 +151,11 @@ def _motion(
 def _diffusion(context: AnalysisContext, events: Sequence[Event]) -> tuple[float, float]:
     """D of a track and its standard error [µm²/s]; 0 where positions are too few, or times open."""
     frames = np.array([event.frame for event in events])
-    rate, exposure_s = exposure_of(context.config)
     if context.config.camera.frame_rate_hz is None or len(np.unique(frames)) < LEAST_POSITIONS:
         return 0.0, 0.0
     places = np.array([event.place[:2] for event in events])
     sigma = np.array([event.fit.sigma[:2] for event in events])
-    track = gather(frames, places, sigma, frame_rate_hz=rate, exposure_ms=1e3 * exposure_s)
-    return track.estimate()
+    return diffusion_of_positions(context.config, frames, places, sigma)
 
 
 def _range_around(model: SizedModel, sizes: Sequence[CommonSize]) -> tuple[float, float]:

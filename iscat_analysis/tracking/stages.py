@@ -25,11 +25,11 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.optics.model import path_variance_nm2
 from iscat_analysis.records import BoolArray, FloatArray
-from iscat_analysis.species.diffusion import gather
 from iscat_analysis.threads import start_in_thread
 from iscat_analysis.tracking.field import BLOCK, MovingField
 from iscat_analysis.tracking.frames import (
     Recording,
+    diffusion_of_positions,
     exposure_of,
     load_field,
     restore_particle_light,
@@ -211,7 +211,7 @@ class Task:
     def blurred(self, state: State) -> State:
         """Give tracks the blur that their D makes."""
         diffusion = diffusion_of(self.config, self.field.free, state.rows)
-        rows, variances = blurred_rows(state.rows, diffusion, exposure_of(self.config)[1])
+        rows, variances = blurred_rows(state.rows, diffusion, exposure_of(self.config))
         self.field.set_blurs(variances)
         return replace(state, rows=rows, variances_nm2=variances, diffusion=diffusion)
 
@@ -425,7 +425,7 @@ def diffusion_of(config: Config, free: BoolArray, rows: Localizations) -> FloatA
     """
     out = np.zeros((int(rows.track.max(initial=-1)) + 1, 2))
     sigma = np.sqrt(variances_left(rows.fisher, np.flatnonzero(free[:4])))[:, :2]
-    error, (rate, exposure) = sigma.max(axis=1), exposure_of(config)
+    error = sigma.max(axis=1)
     apart = ~meeting(rows, config.detection.min_separation_nm)
     for k in range(len(out)):
         mine = apart & (rows.track == k)
@@ -433,9 +433,8 @@ def diffusion_of(config: Config, free: BoolArray, rows: Localizations) -> FloatA
             # a place with 300 times the median error of its track tells nothing
             mine &= error < 300.0 * np.nanmedian(error[mine])
         if mine.sum() >= 4:
-            places = rows.frame[mine], rows.theta[mine, :2], sigma[mine]
-            track = gather(*places, frame_rate_hz=rate, exposure_ms=1e3 * exposure)
-            out[k] = track.estimate()
+            places = rows.theta[mine, :2], sigma[mine]
+            out[k] = diffusion_of_positions(config, rows.frame[mine], *places)
     return out
 
 

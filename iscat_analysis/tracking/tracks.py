@@ -459,7 +459,7 @@ def _models(context: AnalysisContext, tracks: pd.DataFrame) -> dict[int, Forward
     known = np.nan_to_num(tracks["d_um2_s"].to_numpy(float))
     if background_mode(context.config) != "tracks" and not context.model.is_sized:
         known[:] = 0.0
-    _, exposure_s = exposure_of(context.config)
+    exposure_s = exposure_of(context.config)
     upwards = context.config.track.heights_free
     return {
         int(track): blurred(context.wide, path_variance_nm2(d, exposure_s), upwards=upwards)
