@@ -88,6 +88,14 @@ def detector(config: Config) -> tuple[float, float]:
     return camera.pixel_size_nm, camera.read_noise_e
 
 
+def light_of(config: Config, model: ForwardModel, pixel_nm: float) -> tuple[float, float]:
+    """Give the background of a pixel and frame, and what a signal of 1 adds to it [e]."""
+    photons = config.bounds.photons_per_pixel
+    if model.rho:
+        return photons, photons
+    return config.background.level_e or 0.0, photons_per_intensity(model, photons, pixel_nm)
+
+
 def height_of(config: Config) -> float:
     """Height of the particle of ``[bounds]`` [nm]."""
     z_nm = config.bounds.z_nm
@@ -125,13 +133,8 @@ def plan(
     # with ρ = 0 the signal is the scattered light alone, still in units of the reference
     scattered = replace(model, rho=0.0).image(grid, at.x_nm, at.y_nm, height, mass)
     area = collected_area_nm2(model, height, mass) / pixel_nm**2
-    if model.rho:
-        level, per_frame = at.photons_per_pixel, at.photons_per_pixel
-        signal = model.image(grid, at.x_nm, at.y_nm, height, mass)
-    else:
-        level = config.background.level_e or 0.0
-        per_frame = photons_per_intensity(model, at.photons_per_pixel, pixel_nm)
-        signal = scattered
+    signal = model.image(grid, at.x_nm, at.y_nm, height, mass) if model.rho else scattered
+    level, per_frame = light_of(config, model, pixel_nm)
     return Experiment(
         config=config,
         model=model,

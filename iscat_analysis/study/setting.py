@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.bounds import EventBounds, Experiment, plan
+from iscat_analysis.bounds.experiment import detector, light_of
 from iscat_analysis.config import MODES, MOVING, Config, refuse_rod, refuse_sphere
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import Region, region_likelihood
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.optics.model import photons_per_intensity
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Candidate, FloatArray, Windows
 from iscat_analysis.study.estimator_setup import EstimatorSetup
 
@@ -111,17 +111,15 @@ class Setting:
 
     def level_e(self) -> float:
         """Return the expected background per pixel and frame [e]."""
-        if self.context.additive:
-            return self.config.background.level_e or 0.0
-        return self.config.bounds.photons_per_pixel
+        return self._light_e[0]
 
     def signal_e(self, truth: FloatArray) -> FloatArray:
         """Return the counts that the particle adds to one frame, shape (ny, nx) [e]."""
-        model, photons = self.context.model, self.config.bounds.photons_per_pixel
-        signal = model.image(self._grid, *(float(v) for v in truth))
-        if self.context.additive:
-            return signal * photons_per_intensity(model, photons, self.context.pixel_nm)
-        return signal * photons
+        return self._light_e[1] * self.context.model.image(self._grid, *(float(v) for v in truth))
+
+    @property
+    def _light_e(self) -> tuple[float, float]:
+        return light_of(self.config, self.context.model, self.context.pixel_nm)
 
     def draw(self, truth: FloatArray, random: np.random.Generator | None) -> Windows:
         """Draw the counts of one experiment.
@@ -274,14 +272,13 @@ def make_setting(
     config = experiment.config.changed(particle={"photons_per_frame": light})
     centre = (side - 1) / 2 * context.pixel_nm
     at = config.bounds
-    read = config.camera.assumed.read_noise_e
     return Setting(
         config=config,
         context=replace(context, config=config),
         region=Region((0, side), (0, side)),
         experiment=experiment,
         truth=np.array([at.x_nm + centre, at.y_nm + centre, height, experiment.mass_kda]),
-        read_variance_e2=float(read) ** 2 if not isinstance(read, str) else 0.0,
+        read_variance_e2=detector(config)[1] ** 2,
         level=level,
     )
 

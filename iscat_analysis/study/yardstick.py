@@ -26,8 +26,8 @@ from scipy.special import ndtr, ndtri
 
 from iscat_analysis.bounds import Experiment, event_bounds, holevo_over_quantum
 from iscat_analysis.bounds.detection import detection_limit
-from iscat_analysis.bounds.experiment import expected_likelihood
-from iscat_analysis.optics.model import collected_area_nm2, photons_per_intensity
+from iscat_analysis.bounds.experiment import detector, expected_likelihood, light_of
+from iscat_analysis.optics.model import collected_area_nm2
 from iscat_analysis.records import PARAMETERS, BoolArray, FloatArray
 from iscat_analysis.study.scores import MIN_TRIALS
 
@@ -375,19 +375,11 @@ def _one(
 ) -> tuple[FloatArray, FloatArray, FloatArray, float, float]:
     config, model, grid = experiment.config, experiment.model, experiment.grid
     x, y, z, mass = (float(v) for v in truth)
-    photons, (n_before, n_after) = config.bounds.photons_per_pixel, frames
-    if model.rho:
-        background, per_frame = photons, photons
-    else:
-        background = config.background.level_e or 0.0
-        per_frame = photons_per_intensity(model, photons, grid.pixel_nm)
+    light = light_of(config, model, grid.pixel_nm)
     theta = np.array([x, y, z, model.scale.amplitude(mass), 0.0])
-    read = config.camera.assumed.read_noise_e
-    likelihood = expected_likelihood(
-        model, grid, theta, (background, per_frame), (n_before, n_after),
-        read_noise_e=0.0 if isinstance(read, str) else read,
-    )  # fmt: skip
-    collected = n_after * per_frame * collected_area_nm2(model, z, mass) / grid.pixel_nm**2
+    read_noise_e = detector(config)[1]
+    likelihood = expected_likelihood(model, grid, theta, light, frames, read_noise_e=read_noise_e)
+    collected = frames[1] * light[1] * collected_area_nm2(model, z, mass) / grid.pixel_nm**2
     bounds = event_bounds(likelihood, theta, free, collected, level=level)
     index = [PARAMETERS.index(name) for name in free]
     covariance = np.full((len(free), len(free)), np.nan)
