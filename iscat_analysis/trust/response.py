@@ -12,9 +12,9 @@ import scipy
 from numpy.typing import NDArray
 
 from iscat_analysis.bounds import joint_information, peak_gradient
+from iscat_analysis.bounds.experiment import expected_likelihood
 from iscat_analysis.config import ABERRATIONS, Config, Optics, OpticsCovariance
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.inference.counts import asimov_conditional, asimov_poisson
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.maximiser import eliminated, imitation
 from iscat_analysis.inference.models import SphereOfIndex
@@ -66,10 +66,7 @@ class Response:
 
         Shapes: `theta` (5,).
         """
-        before, after = self.frames
-        if before:
-            return asimov_conditional(self.model, self.grid, theta, 1.0, before, after)
-        return asimov_poisson(self.model, self.grid, theta, 1.0, 1.0)
+        return expected_likelihood(self.model, self.grid, theta, (1.0, 1.0), self.frames)
 
     def theta(self, z_nm: float, amplitude: float) -> FloatArray:
         """Parameters of a particle at the centre of the region, (5,)."""
