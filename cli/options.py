@@ -130,7 +130,7 @@ class MovieSetup(Setup):
 
     def of(self, movie: Path, messages: Messages) -> Config:
         """Read the configuration of a movie: those given, else ``iscat.toml`` beside it."""
-        from iscat_analysis.calibration.line import with_line
+        from iscat_analysis.calibration import with_line
         from iscat_analysis.config import load_config
         from iscat_analysis.findings.setup import CONFIGURATION_BESIDE
         from iscat_analysis.movie import setup_beside

@@ -13,7 +13,7 @@ import pandas as pd
 
 from iscat_analysis import calibration
 from iscat_analysis.answers.output import Writing, folder_for, tell
-from iscat_analysis.calibration.line import made_with, measured_contrasts
+from iscat_analysis.calibration import made_with, measured_contrasts
 from iscat_analysis.camera import CameraCalibration, measure_camera
 from iscat_analysis.config import Config
 from iscat_analysis.findings.tables import NO_RECORDED_OPTICS

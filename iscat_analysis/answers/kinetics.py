@@ -35,7 +35,7 @@ import scipy
 from numpy.typing import NDArray
 from scipy.special import chdtrc, exprel, kolmogorov
 
-from iscat_analysis.calibration.line import Line
+from iscat_analysis.calibration import Line
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.findings import Finding, Noted
 from iscat_analysis.findings.tables import CHANCE_PAIRS, NO_DEPLETION_LAW, PARTLY_SEARCHED

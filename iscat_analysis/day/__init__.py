@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.answers.output import Notify, tell
-from iscat_analysis.calibration.line import with_line
+from iscat_analysis.calibration import with_line
 from iscat_analysis.config import Config, configure
 from iscat_analysis.day import compare, gather
 from iscat_analysis.day.calibrate import Day, calibrate_day

@@ -27,7 +27,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.answers.output import Notify, tell
-from iscat_analysis.calibration.line import mass_line
+from iscat_analysis.calibration import mass_line
 from iscat_analysis.config import Config
 from iscat_analysis.day import Batch, batch, checked_options
 from iscat_analysis.day.jobs import Records, claim_folder

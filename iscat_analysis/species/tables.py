@@ -28,7 +28,7 @@ import scipy
 from pydantic import BaseModel
 from scipy.special import log_ndtr
 
-from iscat_analysis.calibration.line import mass_line, weighed
+from iscat_analysis.calibration import mass_line, weighed
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.findings import Finding
 from iscat_analysis.findings import tables as of

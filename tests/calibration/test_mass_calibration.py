@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from shared_errors import systematic
 
+from iscat_analysis import calibration as peaks
 from iscat_analysis.answers.calibrations import read_contrasts
 from iscat_analysis.calibration import (
     calibrate_mass,
@@ -23,7 +24,6 @@ from iscat_analysis.calibration import (
     mass_from_contrast,
     york_line,
 )
-from iscat_analysis.calibration import line as peaks
 from iscat_analysis.config import configure, parse_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.tables import read_events

@@ -10,8 +10,13 @@ import pytest
 import tifffile
 
 import iscat_analysis as ia
-from iscat_analysis.calibration import calibrate_mass, contrast_over, standards_of, with_standards
-from iscat_analysis.calibration.line import with_line
+from iscat_analysis.calibration import (
+    calibrate_mass,
+    contrast_over,
+    standards_of,
+    with_line,
+    with_standards,
+)
 from iscat_analysis.species.tables import event_table, sentences
 from iscat_cli import main
 
