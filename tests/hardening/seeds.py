@@ -7,7 +7,9 @@ folder that holds it where the seed is a folder.
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ import scipy.io
 import tifffile
 import zarr
 from hardening.samples import samples
+from microscopes import configuration
 from tiff_files import movie, write_stk
 
 from iscat_analysis import find_species, fit_kd, open_result
@@ -25,13 +28,17 @@ from iscat_analysis.answers.calibrations import read_contrasts
 from iscat_analysis.camera import read_map
 from iscat_analysis.config import Config, config_to_toml, load_config
 from iscat_analysis.day.table import read_table
+from iscat_analysis.errors import DataError
 from iscat_analysis.executors import open_executor
+from iscat_analysis.files import sha256_of_files
 from iscat_analysis.fitting.run import packed
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.tables import read_events
 from iscat_analysis.optics.waves import Template
 from iscat_analysis.reading import read_json, read_parquet
 from iscat_analysis.records import Clip, EventView
+from iscat_contest.challenge import MANIFEST, TRUTH, make_challenge, parts_of_config, read_challenge
+from iscat_contest.process import Answer, read_answers
 
 Seed = dict[str, bytes]
 Reader = Callable[[Path], Any]
@@ -70,7 +77,20 @@ def seeds(folder: Path) -> dict[str, list[Seed]]:
     template = Template(np.eye(9), np.eye(9), 40.0, 84.4, 160.0, 0.1, 5)
     found["template"] = [{"input": template.to_bytes()}]
     found["address"] = [{"input": b'{"type": "Scheduler", "address": "nowhere", "workers": {}}'}]
+    found["challenge"] = [_challenge(folder / "challenge")]
+    found["answers"] = [{"input": f"{_ANSWER.line()}\n".encode() * 2}]
     return found
+
+
+_ANSWER = Answer({"x_nm": np.array([1.0, np.nan, 3.0, 4.0])}, {"no number": 1}, 0.5, 0.4, 90.0)
+
+
+def _challenge(out: Path) -> Seed:
+    config = configuration(fit={"mode": "mass", "roi_nm": 700.0}, bounds={"pixels": 9})
+    make_challenge(parts_of_config(config, 2), out, name="small")
+    files = sorted(path for path in out.rglob("*") if path.is_file() and path.name[0] != ".")
+    files.sort(key=lambda path: path.name != MANIFEST)
+    return {path.relative_to(out).as_posix(): path.read_bytes() for path in files}
 
 
 def _saved(save: Callable[..., Any], *given: Any, **more: Any) -> bytes:
@@ -251,6 +271,23 @@ def _parts(path: Path) -> None:
     open_result(path.parent)
 
 
+def _signed_challenge(path: Path) -> None:
+    """Read a challenge whose hashes somebody has made anew."""
+    folder = path.parent
+    with suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
+        manifest = json.loads(path.read_bytes())
+        manifest["truth_sha256"] = sha256_of_files([folder / TRUTH])
+        names = [name for name in manifest["files"] if (folder / name).is_file()]
+        manifest["files"] |= {name: sha256_of_files([folder / name]) for name in names}
+        path.write_text(json.dumps(manifest), encoding="utf-8")
+    read_challenge(folder)
+
+
+def _answers(path: Path) -> None:
+    if refused := read_answers(path, [4, 4])[1]:
+        raise DataError(refused)
+
+
 READERS: dict[str, Reader] = {
     "tiff": _frames,
     "map": lambda path: read_map(path, "camera.gain_e_per_adu", (12, 14)),
@@ -273,6 +310,8 @@ READERS: dict[str, Reader] = {
     "cache": _kept_part,
     "template": Template.read,
     "address": _outside,
+    "challenge": _signed_challenge,
+    "answers": _answers,
 }
 """What reads each kind of seed."""
 
