@@ -8,7 +8,7 @@ beside it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, Self
+from typing import Any, Self, TypedDict, Unpack
 
 from pydantic import Field, model_validator
 
@@ -27,6 +27,24 @@ from iscat_analysis.config.synthetic import BoundsConfig, Simulation
 from iscat_analysis.config.values import ALL, LARGEST_NM, Section, unit_guess
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.units import sphere_diameter_nm
+
+Change = Mapping[str, Any] | Section | None
+"""Keys of a section that change, or what takes its place."""
+
+
+class Sections(TypedDict, total=False):
+    """Sections of a configuration that change."""
+
+    optics: Change
+    camera: Change
+    particle: Change
+    background: Change
+    fit: Change
+    track: Change
+    posterior: Change
+    calibration: Change
+    bounds: Change
+    compute: Change
 
 
 class Config(Section):
@@ -78,12 +96,12 @@ class Config(Section):
         for part in (_of_background, _of_particle, _of_fit, _of_template):
             yield from part(self)
 
-    def changed(self, **sections: Mapping[str, Any] | Section | None) -> Config:
+    def changed(self, **sections: Unpack[Sections]) -> Config:
         """Replace keys of sections by values that are known to be valid.
 
         Parameters
         ----------
-        **sections : mapping, Section or None
+        **sections : mapping, section or None
             The keys of a section that change, or what takes its place.
 
         Returns
