@@ -304,6 +304,7 @@ class _Locked(RequestHandler):
         place = f"?{rest}" if rest else "."
         if is_sent(self.request):  # where a redirection would come without the cookie
             self.set_header("Refresh", f"0; url={place}")
+            self.finish()
         else:
             self.redirect(place)
 

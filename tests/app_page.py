@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 PATIENCE_S = 120.0
@@ -22,6 +28,27 @@ const named = (tag, text) => everywhere(document).find(
   (node) => node.matches(tag) && shown(node) && node.textContent.trim() === text);
 """
 """Panel's widgets stand in shadow trees, which selectors do not enter."""
+
+
+@contextmanager
+def serving(folder: Path, port: str, log: Path) -> Iterator[subprocess.Popen[str]]:
+    """Run `iscat app`; Ctrl-C ends it, and it says nothing went wrong."""
+    code = "import sys, iscat_cli; sys.argv = ['iscat', 'app', *sys.argv[1:]]; "
+    code += "sys.exit(iscat_cli.main())"
+    with log.open("w") as errors:
+        server = subprocess.Popen(
+            [sys.executable, "-c", code, str(folder), "--port", port],
+            stdout=subprocess.PIPE, stderr=errors, text=True,
+            env=os.environ | {"BROWSER": "true"},  # which opens nothing
+        )  # fmt: skip
+        assert server.stdout is not None
+        with server.stdout:
+            yield server
+            server.send_signal(signal.SIGINT)
+            assert server.wait(PATIENCE_S) == 0
+    said = log.read_text()
+    assert "unexpected" not in said, said
+    assert "Traceback" not in said, said
 
 
 class Page:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from app_page import PATIENCE_S, Page
+from app_page import Page, serving
 from app_results import SERIES_NM, dimers_result, standards_result
 from browsers import open_browser
 from small_movies import LANDING
@@ -44,24 +41,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def server(
     folder: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[subprocess.Popen[str]]:
-    """Start the command; Ctrl-C ends it, and it says nothing went wrong."""
-    log = tmp_path_factory.mktemp("server") / "log"
-    code = "import sys, iscat_cli; sys.argv = ['iscat', 'app', *sys.argv[1:]]; "
-    code += "sys.exit(iscat_cli.main())"
-    with log.open("w") as errors:
-        server = subprocess.Popen(
-            [sys.executable, "-c", code, str(folder), "--port", "0"],
-            stdout=subprocess.PIPE, stderr=errors, text=True,
-            env=os.environ | {"BROWSER": "true"},  # which opens nothing
-        )  # fmt: skip
-        assert server.stdout is not None
-        with server.stdout:
-            yield server
-            server.send_signal(signal.SIGINT)
-            assert server.wait(PATIENCE_S) == 0
-    said = log.read_text()
-    assert "unexpected" not in said, said
-    assert "Traceback" not in said, said
+    """Start the command, and end it with Ctrl-C."""
+    with serving(folder, "0", tmp_path_factory.mktemp("server") / "log") as server:
+        yield server
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,8 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from functools import partial
+from http.server import BaseHTTPRequestHandler, SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -19,7 +20,7 @@ from urllib.parse import quote
 import numpy as np
 import pandas as pd
 import pytest
-from app_page import PATIENCE_S, Page
+from app_page import PATIENCE_S, Page, serving
 from app_results import SERIES_NM
 from browsers import BROWSER, DRIVER, open_browser
 
@@ -213,6 +214,22 @@ def test_a_page_of_somebody_else_learns_nothing_and_goes_nowhere(
         assert elsewhere.heard == []
 
 
+def test_a_report_draws_itself_in_its_frame(
+    driver: Any, address: str, folder: Path, tmp_path: Path
+) -> None:
+    assert main(["fit", str(folder / "landing.tif"), "--out", str(tmp_path / "a.iscat")]) == 0
+    driver.get(address)
+    place = quote(str(tmp_path / "a.iscat" / "report.html"))
+    driver.get(f"{address.partition('?')[0]}page?path={place}")
+    driver.switch_to.frame(0)
+    page = Page(driver)
+    drawn = "return document.querySelectorAll('svg.marks, canvas.marks').length"
+    page.until("a figure is drawn", lambda: page.script(drawn))
+    assert driver.execute_script("return document.title") == "landing.tif"
+    driver.switch_to.default_content()
+    assert [e["message"] for e in driver.get_log("browser") if "Security Policy" in str(e)] == []
+
+
 def test_another_name_of_this_machine_opens_nothing(address: str, tmp_path: Path) -> None:
     """Red before: a name that is mapped to 127.0.0.1 was answered, `Origin` equal to `Host`."""
     rules = "--host-resolver-rules=MAP elsewhere.example 127.0.0.1"
@@ -226,6 +243,25 @@ def test_another_name_of_this_machine_opens_nothing(address: str, tmp_path: Path
         assert driver.execute_async_script(socket) == "shut"
         driver.get(address.replace("127.0.0.1", "localhost"))  # a name of ours
         Page(driver).says("Choose a movie")
+
+
+def test_a_page_elsewhere_may_hold_the_whole_address_alone(address: str, tmp_path: Path) -> None:
+    """A notebook's terminal, say: its link opens the window, and the token leaves the address."""
+    here = address.partition("?")[0]
+    (tmp_path / "index.html").write_text(f'<a href="{address}">in</a> <a href="{here}">out</a>')
+    handler = partial(SimpleHTTPRequestHandler, directory=tmp_path)
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as elsewhere:
+        threading.Thread(target=elsewhere.serve_forever, daemon=True).start()
+        rules = "--host-resolver-rules=MAP elsewhere.example 127.0.0.1"
+        with open_browser(tmp_path / "profile", rules, logs={}) as driver:
+            for name in ("elsewhere.example", "127.0.0.1"):
+                for words, said in (("in", "Choose a movie"), ("out", "needs the token")):
+                    driver.get(f"http://{name}:{elsewhere.server_port}/index.html")
+                    driver.find_element("link text", words).click()
+                    Page(driver).says(said)
+                    assert driver.current_url == here
+                driver.delete_all_cookies()
+        elsewhere.shutdown()
 
 
 def test_a_link_chooses_a_movie_and_nothing_else(page: Page, address: str, folder: Path) -> None:
@@ -547,6 +583,43 @@ def test_two_tabs_show_two_movies_and_one_queue(page: Page, address: str, folder
     page.says(": done")
     page.open("Compare")
     page.choose("second.iscat")
+
+
+@pytest.mark.large
+def test_a_server_that_ends_with_runs_queued_starts_again_on_its_port(
+    driver: Any, folder: Path, tmp_path: Path
+) -> None:
+    movies = tmp_path / "movies"
+    movies.mkdir()
+    for name, source in (("iscat.toml", ""), ("a.tif", "landing.tif"), ("b.tif", "landing.tif")):
+        shutil.copy(folder / (source or name), movies / name)
+    page, every = Page(driver), "Analyse all movies of the folder"
+    with serving(movies, "0", tmp_path / "first") as server:
+        assert server.stdout is not None
+        address = server.stdout.readline().strip()
+        driver.get(f"{address}&movie={quote(str(movies / 'a.tif'))}")
+        page.open("Run")
+        page.click(every)
+        page.says("2 movies are in the queue", "running")
+        driver.refresh()  # in the middle of a run
+        page.open("Run")
+        page.says("running")
+    here = address.partition("?")[0]
+    assert not list(movies.rglob("*.partial"))
+    with serving(movies, here.rstrip("/").rpartition(":")[2], tmp_path / "second") as server:
+        assert server.stdout is not None
+        again = server.stdout.readline().strip()
+        assert again.startswith(here)
+        driver.get(here)  # with the cookie of the first
+        page.says("needs the token")
+        driver.get(f"{again}&movie={quote(str(movies / 'a.tif'))}")
+        page.open("Run")
+        page.says("Nothing was run yet")
+        page.click(every)
+        page.until("all is done", lambda: len(list(movies.glob("*.iscat/summary.json"))) == 2)
+        page.says(": done")
+    driver.get_log("browser")  # the pages of servers that have ended lost their connections
+    driver.get_log("performance")
 
 
 @pytest.mark.large
