@@ -534,11 +534,20 @@ class StoredResult(MovieResult):
         except (OSError, ValueError) as error:
             raise DataError(f"{folder}: cannot be read as a result ({error})") from None
         self.config: Config = load_config(folder / "config.toml")
-        source, versions, seed = summary["input"], summary.get("versions", {}), summary.get("seed")
         nothing = np.zeros(0)
+        try:
+            source, versions = summary.get("input", {}), summary.get("versions", {})
+            place = str(source.get("path", "")), str(source.get("sha256", ""))
+            provenance = Provenance("", *place, versions, summary.get("seed"), "")
+            mode, findings = str(summary["mode"]), tuple(_findings(summary))
+        except (KeyError, TypeError, AttributeError) as error:
+            raise DataError(
+                f"{folder / 'summary.json'}: is no summary of this version ({error!r}); analyse "
+                "the movie again"
+            ) from None
         self.analysis = Analysis(
             config_toml=(folder / "config.toml").read_text(encoding="utf-8"),
-            mode=str(summary["mode"]),
+            mode=mode,
             scheme=self.config.optics.scheme,
             pixel_size_nm=float(self.config.camera.pixel_size_nm or 0.0),
             table=table,
@@ -547,8 +556,8 @@ class StoredResult(MovieResult):
             power=nothing,
             power_frames=nothing.astype(np.int64),
             summary=summary,
-            provenance=Provenance("", source["path"], source["sha256"], versions, seed, ""),
-            findings=tuple(_findings(summary)),
+            provenance=provenance,
+            findings=findings,
             tracks=tracks,
         )
 
