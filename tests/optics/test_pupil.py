@@ -356,7 +356,8 @@ def test_the_quantum_bound_does_not_know_aberrations(scheme: str) -> None:
         bounds_report(microscope({"scheme": scheme, "aberrations_nm": terms}))["per_photon"]
         for terms in ({}, {"z5": 40.0})
     ]
-    assert reports[0]["qcrb"] == reports[1]["qcrb"]
+    # The same sums; processors round the last digit of their parts differently.
+    assert reports[0]["qcrb"] == pytest.approx(reports[1]["qcrb"], rel=1e-14)
     assert abs(reports[1]["crb_single"]["z_nm"] / reports[0]["crb_single"]["z_nm"] - 1) > 0.01
 
 
