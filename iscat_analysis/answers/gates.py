@@ -85,7 +85,7 @@ def counted_events(folder: Path, rows: pd.DataFrame) -> EventTable:
     What was missed and what the calibration leaves open are of the whole result, as `find_species`
     takes them from its folder, whichever of its events count.
     """
-    whole, counted = event_table(folder), event_table(rows, name=folder.name)
+    whole, counted = event_table(folder, any_scale=True), event_table(rows, name=folder.name)
     kept = ("efficiency", "edge_kda", "scale_error", "window_frames")
     return replace(counted, **{name: getattr(whole, name) for name in kept})
 

@@ -299,7 +299,7 @@ def fit_kinetics(
     >>> found.landing.per_second_low < 400 / 60 < found.landing.per_second_high
     True
     """
-    table = event_table(events, calibration=calibration)
+    table = event_table(events, calibration=calibration, any_scale=True)
     if frame_rate_hz is None and isinstance(events, (str, Path)):
         frame_rate_hz = configured_frame_rate(Path(events))
     if frame_rate_hz is None:

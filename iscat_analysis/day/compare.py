@@ -288,7 +288,7 @@ def _fit(
     condition: str, members: Sequence[Found], columns: Sequence[str], reaction: Reaction
 ) -> Series:
     """Fit all movies of a condition that have enough events."""
-    tables = [event_table(each.folder, name=each.movie.name) for each in members]
+    tables = [event_table(each.folder, name=each.movie.name, any_scale=True) for each in members]
     kept, few = of.with_events(tables)
     remarks = tuple(finding.text for finding in existing([few]))
     used = [each for each, keep in zip(members, kept, strict=True) if keep]

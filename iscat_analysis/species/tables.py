@@ -55,6 +55,9 @@ _RANGES = {
 }  # fmt: skip
 """The columns of numbers that are used, and how large their magnitudes can be."""
 
+MODEL_SCALE = "absolute model"
+"""Scale of masses that no standards and no material give, in ``summary.json``."""
+
 _REJECTED = "rejected_by_hand"  # true of events that somebody left out
 _NAMED = 3  # tables that a note names
 
@@ -133,12 +136,14 @@ def event_table(
     events: str | Path | pd.DataFrame | EventTable,
     *,
     name: str | None = None,
+    any_scale: bool = False,
     **options: Unpack[EventOptions],
 ) -> EventTable:
     """Take events from a file or a table in memory; a table of events stays as it is.
 
     With `calibration` their masses are those of its line, from their contrasts, whatever masses
-    the table has.
+    the table has.  Without it a result on the model's own scale has none, and is refused but for
+    `any_scale`, where whoever asks calls them contrasts.
     """
     given = only(EventOptions, options)
     line, selection = given.pop("calibration"), given.pop("select")
@@ -173,6 +178,12 @@ def event_table(
             f"{called}: has contrasts and no masses; give `calibration`, a mass line as iscat "
             "calibrate mass writes it"
         )
+    elif file is not None and not any_scale and _on_model_scale(Path(file)):
+        raise DataError(
+            f"{called}: has contrasts and no masses, because it was analysed without a mass line "
+            "and an uncalibrated absolute scale is not a mass; give `calibration`, a mass line as "
+            "iscat calibrate mass writes it"
+        )
     if "status" not in table and (doubt := unit_note(table["mass_kda"].to_numpy(float))):
         findings.append(of.AS_READ({"text": doubt}))
     chosen = None if selection is None else _chosen(table, path_in("`select`", selection), called)
@@ -199,6 +210,14 @@ def event_table(
         efficiency = _sharp(edge * (1 - 10 * _CUT_WIDTH))
     findings = [replace(finding, where=called) for finding in (*findings, *found.findings)]
     return replace(found, efficiency=efficiency, edge_kda=edge, findings=tuple(findings))
+
+
+def _on_model_scale(file: Path) -> bool:
+    """Tell whether a table is of a result whose masses were fitted without a scale."""
+    try:
+        return bool(read_json(file.parent / "summary.json")["mass_scale"] == MODEL_SCALE)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False  # no summary, or not ours
 
 
 class _Particle(BaseModel):

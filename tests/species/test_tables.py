@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from iscat_analysis.config.analysis import Calibration
 from iscat_analysis.errors import DataError
 from iscat_analysis.species.tables import event_table
 
@@ -56,3 +57,20 @@ class TestSelection:
         (tmp_path / "no.json").write_text("[]", encoding="utf-8")
         with pytest.raises(DataError, match="is no selection"):
             event_table(self.table(), select=tmp_path / "no.json")
+
+
+@pytest.mark.parametrize(("scale", "refused"), [("absolute model", True), ("calibration", False)])
+def test_masses_on_the_scale_of_the_model_are_no_masses(
+    tmp_path: Path, scale: str, refused: bool
+) -> None:
+    """A sample of 66, 146 and 480 kDa was told as 2985, 6380 and 20 906, labelled kDa."""
+    TestSelection().table().to_csv(tmp_path / "fits.csv", index=False)
+    (tmp_path / "summary.json").write_text(json.dumps({"mass_scale": scale}), encoding="utf-8")
+    if not refused:
+        assert len(event_table(tmp_path).mass_kda) == 60
+        return
+    with pytest.raises(DataError, match="an uncalibrated absolute scale is not a mass"):
+        event_table(tmp_path)
+    assert len(event_table(tmp_path, any_scale=True).mass_kda) == 60
+    line = Calibration(gradient_per_kda=-3.1e-5)
+    assert len(event_table(tmp_path, calibration=line).mass_kda) == 60
