@@ -388,6 +388,7 @@ def _sample_posteriors(
             done.append(chain)
             progress("posterior", len(done), len(events))
     except KeyboardInterrupt:
+        progress("report", 0, 1)  # from here on what was finished is gathered and kept
         stop.set()
         pool.shutdown(cancel_futures=True)
         return done, True
