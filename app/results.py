@@ -192,7 +192,7 @@ class Results:
                         pn.Column(self.which, reject, self._facts, self.listed, back, width=240),
                     ),
                     self._picture,
-                    width=740,
+                    width=640,
                 ),
             ),
         )
