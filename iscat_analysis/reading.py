@@ -105,6 +105,15 @@ def read_json(path: Path) -> Any:
     return json_of(read_text(path))
 
 
+def summary_in(folder: Path) -> dict[str, Any]:
+    """Read ``summary.json`` of a result; empty where there is none, or it is not ours."""
+    try:
+        found = read_json(folder / "summary.json")
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 def json_of(text: str) -> Any:
     """Read JSON."""
     try:

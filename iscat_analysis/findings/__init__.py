@@ -21,4 +21,5 @@ from iscat_analysis.findings.registry import (
     printing,
     unreported,
     warnings_in,
+    worst_first,
 )

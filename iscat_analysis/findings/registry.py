@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import partial
 from string import Formatter
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 Value = float | int | str
 
@@ -190,15 +190,30 @@ class Findings:
     @property
     def summary(self) -> list[dict[str, Any]]:
         """``findings`` of ``summary.json``, the most severe first."""
-        order = list(Severity)[::-1]
-        ranked = sorted(self.made, key=lambda finding: order.index(finding.severity))
-        return [finding.summary for finding in ranked]
+        return [finding.summary for finding in worst_first(self.made)]
 
 
 def capital(text: str) -> str:
     """Begin a text with a capital letter, unless it begins with a key or a symbol."""
     first = text.split(" ")[0]
     return text if set('._`"σ') & set(first) else text[:1].upper() + text[1:]
+
+
+class Judged(Protocol):
+    """What has a severity."""
+
+    @property
+    def severity(self) -> Severity:
+        """How much it matters."""
+
+
+J = TypeVar("J", bound=Judged)
+
+
+def worst_first(judged: Iterable[J]) -> list[J]:
+    """Put the most severe first, and leave what is alike in its order."""
+    order = list(Severity)[::-1]
+    return sorted(judged, key=lambda one: order.index(one.severity))
 
 
 def unreported(finding: Finding) -> None:

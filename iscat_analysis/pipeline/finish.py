@@ -438,7 +438,7 @@ def mass_scale_of(config: Config) -> str:
     """Say where the masses come from: standards, the volume of spheres, or the model alone."""
     if config.fits_sizes:
         return "volume and density"
-    return "calibration" if config.calibration else "absolute model"
+    return "calibration" if config.calibration else records.MODEL_SCALE
 
 
 def reported_rows(

@@ -399,7 +399,7 @@ class MovieResult:
         return lines
 
     def __repr__(self) -> str:
-        said, wrap = answer.spoken(self.analysis), textwrap.TextWrapper(78).wrap
+        said = answer.spoken(self.analysis)
         wrap = textwrap.TextWrapper(78, initial_indent="  ", subsequent_indent="    ").wrap
         rows = [[column.label for column in said.species.columns], *said.species.rows]
         wide = [max(map(len, cells)) for cells in zip(*rows, strict=True)]

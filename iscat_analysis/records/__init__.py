@@ -10,6 +10,7 @@ from iscat_analysis.records.columns import (
     EVENTS,
     FRAME_COLUMN,
     FREE_PARAMETERS,
+    MODEL_SCALE,
     NO_MODEL,
     POOR_P,
     REPEAT_COLUMNS,

@@ -327,6 +327,9 @@ TRACKS += tuple(replace(column, optional=True) for column in (
 ))  # fmt: skip
 
 
+MODEL_SCALE = "absolute model"
+"""Scale of masses that neither standards nor a material give, in ``summary.json``."""
+
 BUDGET_COLUMNS = ("name", "kind", "common", "sigma_mass_kda", "sigma_rel", "dof", "remedy")
 """Columns of the error budget of a mass."""
 

@@ -17,8 +17,15 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
 from iscat_analysis.inference.checks import truth_in
 from iscat_analysis.movie import refuse_twice
-from iscat_analysis.reading import first_line, is_file, open_regular, read_json
-from iscat_analysis.records import EVENT_COLUMNS, FloatArray, Status, is_event, track_numbers
+from iscat_analysis.reading import first_line, is_file, open_regular, summary_in
+from iscat_analysis.records import (
+    EVENT_COLUMNS,
+    MODEL_SCALE,
+    FloatArray,
+    Status,
+    is_event,
+    track_numbers,
+)
 from iscat_analysis.report.tables import write_csv
 from iscat_analysis.units import count
 
@@ -214,7 +221,7 @@ def export_result(
     if left := len(fits) - len(rows):
         notes.append(f"{count(left, 'event')} whose status is not ok, or without a place, left out")
     if layout == "photomol" and not _calibrated(folder):
-        fixed = _summary(folder).get("mode") == "localize"
+        fixed = summary_in(folder).get("mode") == "localize"
         why = "mode localize fits no mass" if fixed else "without [calibration] there are no masses"
         notes.append(f"contrasts alone, for {why}")
     return Exported(path, count(len(rows), noun), tuple(notes))
@@ -222,7 +229,7 @@ def export_result(
 
 def _metadata(folder: Path, fits: pd.DataFrame) -> dict[str, Any]:
     """Metadata of the movie that Picasso needs."""
-    shape = _summary(folder).get("input", {}).get("shape")
+    shape = summary_in(folder).get("input", {}).get("shape")
     if not shape:
         raise DataError(
             f"{folder / 'summary.json'}: does not say how large the movie is, as newer results do; "
@@ -238,19 +245,10 @@ def _metadata(folder: Path, fits: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def _summary(folder: Path) -> dict[str, Any]:
-    """Read ``summary.json``; empty where it cannot be read."""
-    try:
-        found = read_json(folder / "summary.json")
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
-
-
 def _calibrated(folder: Path) -> bool:
     """Whether masses are calibrated; true for a table of unknown origin."""
-    summary = _summary(folder)
-    return summary.get("mode") != "localize" and summary.get("mass_scale") != "absolute model"
+    summary = summary_in(folder)
+    return summary.get("mode") != "localize" and summary.get("mass_scale") != MODEL_SCALE
 
 
 def _napari(rows: pd.DataFrame) -> FloatArray:

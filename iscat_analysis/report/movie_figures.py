@@ -26,7 +26,6 @@ from iscat_analysis.records import (
     FloatArray,
     PosteriorResult,
     Status,
-    Trace,
     counted,
     free_parameters,
     track_numbers,
@@ -137,6 +136,11 @@ class Sample:
         """Rows of ``fits.csv``."""
         return event_table(self.analysis)
 
+    @cached_property
+    def counted(self) -> pd.DataFrame:
+        """Those rows of ``fits.csv`` that count as events, or as positions."""
+        return counted(self.fits).reset_index(drop=True)
+
     @property
     def kind(self) -> RowKind:
         """Whether its rows are events or tracks."""
@@ -146,7 +150,7 @@ class Sample:
     def rows(self) -> pd.DataFrame:
         """One row for each event, or each track, numbered in the column ``event``."""
         if self.kind is EVENTS_KIND:
-            return counted(self.fits).reset_index(drop=True)
+            return self.counted
         return tracks_of(self.analysis).rename(columns={"track": "event"}).reset_index(drop=True)
 
     @cached_property
@@ -166,7 +170,7 @@ class Sample:
     @property
     def is_signed(self) -> bool:
         """Whether values below zero are another thing than particles that leave."""
-        return self.quantity.unit == "nm" and self.quantity.column == "z_nm"
+        return self.quantity.column == "z_nm"
 
     @cached_property
     def values(self) -> tuple[FloatArray, FloatArray]:
@@ -236,7 +240,7 @@ class Sample:
     @cached_property
     def free(self) -> tuple[str, ...]:
         """Parameters that were fitted."""
-        return tuple(free_parameters(self.analysis.mode, counted(self.fits)))
+        return tuple(free_parameters(self.analysis.mode, self.counted))
 
     def scaled(self, table: pd.DataFrame) -> pd.DataFrame:
         """Put what the main quantity is in the place of masses: diameters, contrasts [10⁻³]."""
@@ -254,7 +258,7 @@ class Sample:
 
     def precision_of(self, name: str) -> Precision:
         """Set σ of one parameter beside its bounds, on the scale of the main quantity."""
-        table = counted(self.fits)
+        table = self.counted
         found = precision_of(self.analysis, self.scaled(table), name)
         if self.unit(name) == UNITS[name]:
             return found
@@ -348,11 +352,11 @@ def movie_figures(analysis: Analysis) -> dict[str, VegaFigure]:
     dict of str to VegaFigure
         Figures by name, in the order of the page; those that would be empty are left out.
     """
-    sample = Sample(analysis)
-    return dict(_figures(sample))
+    return dict(figures_of(Sample(analysis)))
 
 
-def _figures(sample: Sample) -> Iterator[tuple[str, VegaFigure]]:
+def figures_of(sample: Sample) -> Iterator[tuple[str, VegaFigure]]:
+    """Make the figures of a sample one after the other, in the order of the page."""
     analysis, rows = sample.analysis, len(sample.rows)
     tracked = sample.kind is not EVENTS_KIND
     known = np.isfinite(sample.values[0]).any()
@@ -586,7 +590,7 @@ def limit(sample: Sample) -> VegaFigure | None:
 
 def precision(sample: Sample) -> VegaFigure | None:
     """Show σ and QCRB of each particle against its CRB, for every free parameter."""
-    table, parts = sample.scaled(counted(sample.fits)), []
+    table, parts = sample.scaled(sample.counted), []
     for name in sample.free:
         kept = table[table[f"crb_{name}"] > 0]
         kept = kept.iloc[:: 1 + len(kept) // MOST_DOTS]
@@ -625,7 +629,7 @@ def spread(sample: Sample) -> VegaFigure | None:
         measured = measured.assign(
             low=measured["value"] - measured["error"], high=measured["value"] + measured["error"]
         )
-        last = measured["frames"].max() if tracked else counted(analysis.table)["n_after"].median()
+        last = measured["frames"].max() if tracked else sample.counted["n_after"].median()
         low, high = part["repeat_over_crb_ci95"]
         end = {"frames": last, "value": reached, "low": low, "high": high, "kind": whole}
         found = [measured, pd.DataFrame([end])]
@@ -870,25 +874,6 @@ _DETAILS: Mapping[str, Any] = {
 
 
 # ---- Single particles ----------------------------------------------------------------------------
-
-
-def trace_data(trace: Trace) -> dict[str, dict[str, list[Any]]]:
-    """Give the contrast of each frame around a step, their means, and the fitted step."""
-    length = max(1, round(len(trace.contrast) / 40))  # frames of a mean
-    start = (trace.frame - trace.first) % length  # none across the step
-    many = (len(trace.contrast) - start) // length
-    parts = trace.contrast[start : start + many * length].reshape(many, length)
-    some = np.flatnonzero(np.isfinite(parts).any(axis=1))
-    frames = trace.first + np.arange(len(trace.contrast))
-    middles = trace.first + start + (some + 0.5) * length
-    turns = [trace.used[0], trace.frame, trace.frame, trace.used[1]]
-    levels = np.array([trace.before, trace.before, trace.after, trace.after])
-    data = {
-        "frames": {"frame": frames, "contrast": np.round(1e3 * trace.contrast, 3)},
-        "means": {"frame": middles, "contrast": np.round(1e3 * np.nanmean(parts[some], axis=1), 3)},
-        "step": {"order": range(4), "frame": turns, "contrast": 1e3 * levels},
-    }
-    return {name: columns_of(columns) for name, columns in data.items()}
 
 
 def _corners(analysis: Analysis) -> Iterator[tuple[str, VegaFigure]]:

@@ -18,16 +18,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.findings import Finding, Severity, Subject
+from iscat_analysis.findings import Finding, Severity, Subject, worst_first
 from iscat_analysis.findings.results import INTERRUPTED, NOT_A_MASS, NOTHING_FOUND
 from iscat_analysis.records import (
     EVENTS,
     PARAMETERS,
+    POOR_P,
     TRACKS,
     Analysis,
     EventView,
     FloatArray,
-    counted,
     tally,
 )
 from iscat_analysis.report.answer import (
@@ -44,7 +44,7 @@ from iscat_analysis.report.answer import (
     track_lines,
     tracks_of,
 )
-from iscat_analysis.report.movie_figures import COLOURS, Sample, movie_figures
+from iscat_analysis.report.movie_figures import COLOURS, Sample, figures_of
 from iscat_analysis.report.numbers import (
     UNITS,
     Fact,
@@ -95,13 +95,13 @@ MUCH_NOISE = 0.2
 
 def render_report(analysis: Analysis) -> str:
     """Make the result page of one analysis, with everything that it shows inside."""
-    return render_page("report.html", page_context(analysis, movie_figures(analysis)))
-
-
-def page_context(analysis: Analysis, figures: Mapping[str, VegaFigure]) -> dict[str, Any]:
-    """Collect everything that ``report.html`` shows."""
     sample = Sample(analysis)
-    kind = sample.kind
+    return render_page("report.html", page_context(sample, dict(figures_of(sample))))
+
+
+def page_context(sample: Sample, figures: Mapping[str, VegaFigure]) -> dict[str, Any]:
+    """Collect everything that ``report.html`` shows."""
+    analysis, kind, findings = sample.analysis, sample.kind, _all_findings(sample)
     sampled = [view for view in analysis.views if view.posterior is not None]
     images = event_details(analysis, sample.rows)
     columns = _columns(sample)
@@ -126,8 +126,8 @@ def page_context(analysis: Analysis, figures: Mapping[str, VegaFigure]) -> dict[
         "counts": f"{count(len(sample.rows), kind.noun)}, {int(sample.is_ok.sum())} ok",
         "species": _species_table(sample),
         "facts": [] if sample.species else _facts(sample),
-        "trust": trust(sample),
-        "findings": _all_findings(sample),
+        "trust": trust(sample, findings),
+        "findings": findings,
         "figures": figures,
         "noun": kind.noun,
         "tables": ["fits", "tracks"] if kind is TRACKS_KIND else ["fits"],
@@ -224,7 +224,7 @@ def _species_notes(sample: Sample) -> list[str]:
 def _facts(sample: Sample) -> list[Fact]:
     """Give the answer where there are no species: a single value, a range, or a height."""
     analysis = sample.analysis
-    facts = list(answers(analysis, counted(sample.fits)))
+    facts = list(answers(analysis, sample.counted))
     heights = analysis.summary.get("heights")
     if facts and heights is not None and not heights["held"]:
         mean, error, spread = (fixed(heights[f"{key}_nm"], 1) for key in ("mean", "mean_se", "sd"))
@@ -257,7 +257,7 @@ class Trust:
 
 def _all_findings(sample: Sample) -> list[Finding]:
     """List all findings, the most severe first; those of the table of results are among them."""
-    analysis, table = sample.analysis, counted(sample.fits)
+    analysis, table = sample.analysis, sample.counted
     judged = table if sample.kind is EVENTS_KIND else tracks_of(analysis)
     found = list(analysis.findings)
     if analysis.summary.get("interrupted"):
@@ -268,14 +268,11 @@ def _all_findings(sample: Sample) -> list[Finding]:
         own = (rejection(table), caution(judged, sample.kind) if len(judged) else None)
         found += [each for each in own if each is not None]
         found += [NOT_A_MASS()] if is_uncalibrated(analysis) else []
-    ranks = list(Severity)
-    once = {finding.text: finding for finding in found}.values()
-    return sorted(once, key=lambda finding: -ranks.index(finding.severity))
+    return worst_first({finding.text: finding for finding in found}.values())
 
 
-def trust(sample: Sample) -> list[Trust]:
+def trust(sample: Sample, found: Sequence[Finding]) -> list[Trust]:
     """Say of camera, optics, errors and scale whether to believe them, the worst first."""
-    found = _all_findings(sample)
     lines = []
     for subject, reassure in _REASSURING.items():
         doubts = [
@@ -290,8 +287,7 @@ def trust(sample: Sample) -> list[Trust]:
             lines.append(Trust(subject, first.severity, text, remedy, len(doubts) - 1))
         elif (line := reassure(sample)) is not None:
             lines.append(line)
-    ranks = list(Severity)
-    return sorted(lines, key=lambda line: -ranks.index(line.severity))
+    return worst_first(lines)
 
 
 def _camera(sample: Sample) -> Trust | None:
@@ -307,16 +303,16 @@ def _camera(sample: Sample) -> Trust | None:
 
 
 def _optics(sample: Sample) -> Trust | None:
-    p_values = counted(sample.fits)["p_value"].dropna()
+    p_values = sample.counted["p_value"].dropna()
     if not p_values.size:
         return None
-    good = int((p_values >= 0.01).sum())
-    text = f"The optics describe the particles: p ≥ 0.01 for {good} of {p_values.size} fits"
+    good = int((p_values >= POOR_P).sum())
+    text = f"The optics describe the particles: p ≥ {POOR_P:g} for {good} of {p_values.size} fits"
     return Trust(Subject.OPTICS, Severity.NOTE, text, target="diagnostics")
 
 
 def _errors(sample: Sample) -> Trust | None:
-    table = counted(sample.fits)
+    table = sample.counted
     p = precision_of(sample.analysis, table, main_parameter(sample.analysis))
     if p.is_measured:
         text = f"Errors are right: the measured spread is {p.measured_text} times the bound"

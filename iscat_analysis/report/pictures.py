@@ -17,6 +17,7 @@ from PIL import Image, WebPImagePlugin
 from iscat_analysis.config import SCHEMES
 from iscat_analysis.records import Analysis, Clip, EventView, FloatArray, Trace
 from iscat_analysis.report.numbers import number
+from iscat_analysis.report.vega import columns_of
 from iscat_analysis.units import count
 
 DETAIL_BYTES, FILM_BYTES = 1_000_000, 800_000
@@ -148,8 +149,6 @@ def event_details(analysis: Analysis, table: pd.DataFrame) -> dict[int, dict[str
     Keys are rows; a value has `strip`, `scales`, and where they are known `trace` with `told`, and
     `clip` with `frames`, `still` and `sliding`.
     """
-    from iscat_analysis.report.movie_figures import trace_data
-
     packed: dict[int, dict[str, Any]] = {}
     spent = min(ROW_BYTES * len(table), DETAIL_BYTES * 3 // 4)
     for row, view in views_of_rows(table, analysis.views):
@@ -168,6 +167,25 @@ def event_details(analysis: Analysis, table: pd.DataFrame) -> dict[int, dict[str
             break
         packed[row] = detail
     return packed
+
+
+def trace_data(trace: Trace) -> dict[str, dict[str, list[Any]]]:
+    """Give the contrast of each frame around a step, their means, and the fitted step."""
+    length = max(1, round(len(trace.contrast) / 40))  # frames of a mean
+    start = (trace.frame - trace.first) % length  # none across the step
+    many = (len(trace.contrast) - start) // length
+    parts = trace.contrast[start : start + many * length].reshape(many, length)
+    some = np.flatnonzero(np.isfinite(parts).any(axis=1))
+    frames = trace.first + np.arange(len(trace.contrast))
+    middles = trace.first + start + (some + 0.5) * length
+    turns = [trace.used[0], trace.frame, trace.frame, trace.used[1]]
+    levels = np.array([trace.before, trace.before, trace.after, trace.after])
+    data = {
+        "frames": {"frame": frames, "contrast": np.round(1e3 * trace.contrast, 3)},
+        "means": {"frame": middles, "contrast": np.round(1e3 * np.nanmean(parts[some], axis=1), 3)},
+        "step": {"order": range(4), "frame": turns, "contrast": 1e3 * levels},
+    }
+    return {name: columns_of(columns) for name, columns in data.items()}
 
 
 def trace_words(trace: Trace) -> str:

@@ -51,12 +51,12 @@ from iscat_analysis.report.answer import (
 )
 from iscat_analysis.report.movie_figures import (
     CREDIBLE_LEVELS,
+    MOST_ERRORS,
     bin_width,
     credible_shades,
-    trace_data,
 )
 from iscat_analysis.report.numbers import UNITS, number, parameter
-from iscat_analysis.report.pictures import display_range, residual_limit
+from iscat_analysis.report.pictures import display_range, residual_limit, trace_data
 from iscat_analysis.report.style import (
     BLUE,
     DPI,
@@ -86,9 +86,6 @@ DIVERGING = LinearSegmentedColormap.from_list("residual", ["#00528C", "#FAFAF8",
 
 EVENT_FIGURES = 12
 """Events whose images are written, at most."""
-
-MOST_ERRORS = 400
-"""Tracks whose errors are drawn beside their points; more would hide them."""
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -17,10 +17,11 @@ instrument's; the width of a species then holds its error.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, Unpack
+from typing import Any, Literal, Unpack
 
 import numpy as np
 import pandas as pd
@@ -35,8 +36,8 @@ from iscat_analysis.findings import tables as of
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie.tables import named, read_events, unit_note
 from iscat_analysis.options import EventOptions, only, takes
-from iscat_analysis.reading import read_json
-from iscat_analysis.records import BoolArray, FloatArray, species_rows
+from iscat_analysis.reading import read_json, summary_in
+from iscat_analysis.records import MODEL_SCALE, BoolArray, FloatArray, species_rows
 from iscat_analysis.species.events import POSSIBLE_KDA, Efficiency, Events, possible
 from iscat_analysis.units import count, listed
 
@@ -54,9 +55,6 @@ _RANGES = {
     "x_px": _PIXELS, "y_px": _PIXELS,
 }  # fmt: skip
 """The columns of numbers that are used, and how large their magnitudes can be."""
-
-MODEL_SCALE = "absolute model"
-"""Scale of masses that no standards and no material give, in ``summary.json``."""
 
 _REJECTED = "rejected_by_hand"  # true of events that somebody left out
 _NAMED = 3  # tables that a note names
@@ -169,6 +167,7 @@ def event_table(
         called = name or str(events)
         table = read_events(Path(events))
     file = table.attrs.get("file")
+    summary = {} if file is None else summary_in(Path(file).parent)
     findings = [of.AS_READ({"text": note}) for note in table.attrs["notes"]]
     if line is not None:
         table, times = weighed(table, mass_line(line), called)
@@ -178,7 +177,7 @@ def event_table(
             f"{called}: has contrasts and no masses; give `calibration`, a mass line as iscat "
             "calibrate mass writes it"
         )
-    elif file is not None and not any_scale and _on_model_scale(Path(file)):
+    elif not any_scale and summary.get("mass_scale") == MODEL_SCALE:
         raise DataError(
             f"{called}: has contrasts and no masses, because it was analysed without a mass line "
             "and an uncalibrated absolute scale is not a mass; give `calibration`, a mass line as "
@@ -203,21 +202,13 @@ def event_table(
         spread = limit_sigma_kda or float(np.median(found.sigma_kda))
         efficiency = Efficiency(limit_kda / spread, spread)
     elif "snr" in table:
-        efficiency = _from_snr(table, None if file is None else Path(file))
+        efficiency = _from_snr(table, summary)
     edge = None
     if efficiency is None:
         edge = float(np.abs(found.mass_kda).min())
         efficiency = _sharp(edge * (1 - 10 * _CUT_WIDTH))
     findings = [replace(finding, where=called) for finding in (*findings, *found.findings)]
     return replace(found, efficiency=efficiency, edge_kda=edge, findings=tuple(findings))
-
-
-def _on_model_scale(file: Path) -> bool:
-    """Tell whether a table is of a result whose masses were fitted without a scale."""
-    try:
-        return bool(read_json(file.parent / "summary.json")["mass_scale"] == MODEL_SCALE)
-    except (OSError, ValueError, KeyError, TypeError):
-        return False  # no summary, or not ours
 
 
 class _Particle(BaseModel):
@@ -394,7 +385,7 @@ def _sharp(edge_kda: float) -> Efficiency:
     return Efficiency(1 / _CUT_WIDTH, edge_kda * _CUT_WIDTH)
 
 
-def _from_snr(table: pd.DataFrame, path: Path | None) -> Efficiency | None:
+def _from_snr(table: pd.DataFrame, summary: Mapping[str, Any]) -> Efficiency | None:
     """Estimate threshold and noise of the filter from a table of this program."""
     good = species_rows(table)[0] if "status" in table else table
     snr = good["snr"].to_numpy(dtype=float)
@@ -404,13 +395,9 @@ def _from_snr(table: pd.DataFrame, path: Path | None) -> Efficiency | None:
         return None
     # The smallest value, less the mean distance of values near it.
     threshold, searched = float(few[0] - np.ptp(few) / max(few.size - 1, 1)), 1.0
-    if path is not None:
-        try:
-            summary = read_json(path.parent / "summary.json")
-            stored = float(summary["detection_threshold_snr"] or threshold)
-            threshold = stored if 0 < stored < _RATIOS[1] else threshold
-            share = float(summary["landing"]["searched_share"])
-            searched = share if 0 < share <= 1 else 1.0
-        except (OSError, ValueError, KeyError, TypeError):
-            pass  # no summary, or not ours: the table alone must do
+    with suppress(ValueError, KeyError, TypeError):  # not ours: the table alone must do
+        stored = float(summary["detection_threshold_snr"] or threshold)
+        threshold = stored if 0 < stored < _RATIOS[1] else threshold
+        share = float(summary["landing"]["searched_share"])
+        searched = share if 0 < share <= 1 else 1.0
     return filter_efficiency(good, threshold, searched)

@@ -15,8 +15,14 @@ from report_factory import make_analysis, with_traces
 from iscat_analysis.fitting.run import packed, unpacked
 from iscat_analysis.notebook import Result
 from iscat_analysis.records import Clip, EventView, Trace
-from iscat_analysis.report.movie_figures import trace_data
-from iscat_analysis.report.pictures import CLIP_MS, Scale, clip_shown, event_details, trace_words
+from iscat_analysis.report.pictures import (
+    CLIP_MS,
+    Scale,
+    clip_shown,
+    event_details,
+    trace_data,
+    trace_words,
+)
 from iscat_analysis.report.tables import event_table
 
 

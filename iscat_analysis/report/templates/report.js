@@ -43,7 +43,6 @@
   for (let power = Math.floor(Math.log10(first)) - 2; power <= Math.floor(Math.log10(first)) + 2; power += 1) for (const step of [1, 2, 2.5, 5]) widths.push(step * 10 ** power);
   const middle = widths.reduce((best, w, k) => (Math.abs(Math.log(w / first)) < Math.abs(Math.log(widths[best] / first)) ? k : best), 0);
   const slider = byId("bin");
-  if (slider) slider.max = 12, slider.value = 6;
   const say = () => { byId("bin-value").textContent = `${+width.toPrecision(3)} ${held.unit}`.trim(); };
   const bars = () => {
     const view = views.get("masses");
