@@ -214,7 +214,7 @@ class Sample:
         """All species that are more than a few events; the background is none."""
         found = species_of(self.analysis)
         column, told = str(found.columns[0]), [each.name for each in fields(Species)]
-        if column != self.quantity.column:
+        if column not in (self.quantity.column, self.quantity.column.removeprefix("optical_")):
             return []
         known = found.rename(columns={column: "value", f"sigma_{column}": "sigma"})
         known = known.rename(columns={f"systematic_{column}": "systematic"})

@@ -19,7 +19,7 @@ from iscat_analysis.notebook import Result
 from iscat_analysis.records import FREE_PARAMETERS, TRACK_COLUMNS, free_parameters
 from iscat_analysis.report import pictures, render_report, write_report
 from iscat_analysis.report.answer import spoken
-from iscat_analysis.report.movie_figures import mean_squared_displacement, movie_figures
+from iscat_analysis.report.movie_figures import Sample, mean_squared_displacement, movie_figures
 from iscat_analysis.report.pictures import films_shown
 from iscat_analysis.report.vega import figures_in
 
@@ -124,3 +124,23 @@ def test_a_result_shows_its_tracks() -> None:
     assert list(Result(make_analysis(3)).tracks.columns) == list(TRACK_COLUMNS)
     assert result.overview() is not None
     assert result.histogram() is not None
+
+
+def test_populations_of_spheres_that_move_are_the_answer() -> None:
+    analysis = make_analysis(200, "track")
+    assert analysis.tracks is not None
+    sizes = np.random.default_rng(5).lognormal(np.log(100), 0.05, len(analysis.tracks))
+    tracks = analysis.tracks.assign(
+        status="ok", flags="", diameter_nm=sizes, optical_diameter_nm=sizes,
+        sigma_diameter_nm=2.0, sigma_optical_diameter_nm=2.0,
+    )  # fmt: skip
+    one = {
+        "diameter_nm": 100.0, "diameter_low": 97.0, "diameter_high": 103.0, "geometric_sd": 1.05,
+        "count": 20.0, "fraction": 1.0, "fraction_low": 1.0, "fraction_high": 1.0, "outlier": False,
+    }  # fmt: skip
+    curve = {"diameter_nm": [90.0, 100.0, 110.0], "model": [0.1, 0.8, 0.1]}
+    summary = {**analysis.summary, "sizes": {"populations": [one], "curve": curve, "notes": []}}
+    sample = Sample(replace(analysis, tracks=tracks, summary=summary))
+    assert [each.name for each in sample.species] == ["100"]
+    assert set(sample.members) == {0}
+    assert movie_figures(sample.analysis)["masses"].data["peaks"]["label"] == ["100 nm"]

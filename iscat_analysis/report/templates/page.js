@@ -27,13 +27,12 @@ const iscat = (() => {
     const axis = { labelColor: soft, titleColor: soft, gridColor: grid, domainColor: grid, tickColor: grid };
     return isDark() ? { axis, legend: { labelColor: soft, titleColor: soft }, header: { labelColor: ink }, title: { color: ink }, text: { color: soft }, rule: { color: soft } } : {};
   };
-  const merged = (one, two) => Object.fromEntries([...new Set([...Object.keys(one), ...Object.keys(two)])].map((key) => [key, two[key] === undefined ? one[key] : typeof two[key] === "object" && two[key] !== null && typeof one[key] === "object" ? { ...one[key], ...two[key] } : two[key]]));
   const brighter = { "#0072b2": "#56b4e9", "#d55e00": "#ff8a3d", "#009e73": "#2fd6a3", "#cc79a7": "#f0a5cf", "#e69f00": "#ffd166", "#7d858f": "#a6aeb8" };
   const onDark = (spec) => JSON.parse(JSON.stringify(spec).replace(/#[0-9a-f]{6}/g, (colour) => brighter[colour] ?? colour));
   const show = async (node, given, data) => {
     const spec = isDark() ? onDark(given) : given;
     const many = Math.max(0, ...Object.values(data).map((part) => part.length));
-    const { view } = await vegaEmbed(node, { ...spec, config: merged(held.config, themed()), datasets: data }, { actions: false, ast: true, renderer: many > 1500 ? "canvas" : "svg", tooltip: { theme: isDark() ? "dark" : "light" } });
+    const { view } = await vegaEmbed(node, { ...spec, config: themed(), datasets: data }, { config: held.config, actions: false, ast: true, renderer: many > 1500 ? "canvas" : "svg", tooltip: { theme: isDark() ? "dark" : "light" } });
     return view;
   };
   const dataOf = (id) => Object.fromEntries(Object.entries(held.figures[id].usermeta.datasets).map(([local, key]) => [local, rows(key)]));

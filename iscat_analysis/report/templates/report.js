@@ -7,7 +7,7 @@
   if (!held.rows) return;
   const events = rows("events").map((event, row) => Object.assign(event, { row, marked: true })), still = matchMedia("(prefers-reduced-motion: reduce)").matches;
   const rejected = new Set(), gates = [];
-  let marked = null, interval = null, opened = -1, page = 0, order = events.map((_, k) => k);
+  let asked = null, marked = null, interval = null, opened = -1, page = 0, order = events.map((_, k) => k);
 
   // ---- what is marked
   const figuresOfEvents = ["field", "time", "mobility"];
@@ -28,6 +28,7 @@
   };
   let waiting = false;
   const mark = (test, range = null) => {
+    asked = test;
     events.forEach((event) => { event.marked = (test === null || test(event)) && !rejected.has(event.event); });
     marked = test === null ? null : new Set(events.filter((event) => event.marked).map((event) => event.row));
     interval = range;
@@ -195,8 +196,7 @@
     const number = events[opened].event;
     if (!rejected.delete(number)) rejected.add(number);
     byId("reject").textContent = rejected.has(number) ? "Take back" : "Reject";
-    events.forEach((event) => { event.marked = (!marked || marked.has(event.row)) && !rejected.has(event.event); });
-    refresh();
+    mark(asked, interval);
   });
   addEventListener("keydown", (event) => {
     if (panel.hidden || /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
